@@ -69,14 +69,14 @@ def _files() -> dict[str, list[str]]:
 
 
 def opening(name: str) -> list[str]:
-    """The comment at the top of a file of conf/, line by line."""
+    """Return the comment at the top of a file of conf/, line by line."""
     lines = _file(name).read_text(encoding="utf-8").splitlines()
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
 
 
 def sentence(name: str) -> str:
-    """What a command or preset is, in a sentence: the first of the comment at the top of its file, without its name."""
+    """Describe a command or preset: the first sentence of the comment at the top of its file, without its name."""
     if name in _added:
         return _added[name].what
     first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
@@ -93,7 +93,7 @@ def _file(name: str) -> Path:
 
 
 def program(command: str) -> str:
-    """The module that `python -m` runs."""
+    """Return the module that `python -m` runs."""
     path = _placed.get(command)
     parts = ("experiments", command) if path is None else path.relative_to(ROOT.parent).with_suffix("").parts
     return ".".join(parts)
@@ -105,7 +105,7 @@ def commands() -> list[str]:
 
 
 def chosen(command: str) -> dict[str, str | None]:
-    """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
+    """Map each group that a command composes, at the place of its own, to the option it starts with."""
     root = yaml.safe_load(_file(command).read_text(encoding="utf-8")) or {}
     entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
     found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
@@ -113,7 +113,7 @@ def chosen(command: str) -> dict[str, str | None]:
 
 
 def owner(name: str) -> str | None:
-    """The command that a recipe is for, which a line `# @command NAME` says; None for a preset that serves any.
+    """Return the command that a recipe is for (line `# @command NAME`); None for a preset that serves any command.
 
     Args: name: group and option, "experiment/paper".
     """
@@ -124,7 +124,7 @@ def owner(name: str) -> str | None:
 
 
 def companion(name: str) -> str | None:
-    """The preset of another group that belongs to this one, `agent=relative`, which a line `# @with ...` says.
+    """Return the preset of another group that belongs to this one, `agent=relative` (line `# @with ...`).
 
     Args: name: group and option, "env/relative".
     """
@@ -136,12 +136,12 @@ def companion(name: str) -> str | None:
 
 
 def options(command: str, group: str) -> list[str]:
-    """The presets of a group that a command accepts."""
+    """List the presets of a group that a command accepts."""
     return [option for option in groups()[group] if owner(f"{group}/{option}") in (None, command)]
 
 
 def load(name: str) -> dict[str, Any]:
-    """What a preset changes, together with the presets of its group that it starts from.
+    """Load what a preset changes, together with the presets of its group that it starts from.
 
     Args: name: group and option, "plant/bench".
     Raises: ValueError naming the presets of the group.

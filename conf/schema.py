@@ -58,7 +58,7 @@ class Meaning:
         )
 
     def allowed(self, key: str, many: bool = False, optional: bool = False) -> str:
-        """The range in words, "" if every value of the type is allowed.
+        """Describe the range in words, "" if every value of the type is allowed.
 
         Args: key: name of the field; many: it is a tuple; optional: it may be null.
         """
@@ -105,7 +105,7 @@ class Entry:
 
 
 def entries(config: Any) -> list[Entry]:
-    """The fields of a config dataclass, in order."""
+    """List the fields of a config dataclass, in order."""
     return [
         Entry(f.name, f.metadata.get("meaning", Meaning("")), getattr(config, f.name), "None" in str(f.type))
         for f in fields(config)
@@ -113,7 +113,7 @@ def entries(config: Any) -> list[Entry]:
 
 
 def setting(default: T, what: str, unit: str = "", within: tuple[float, float] | None = None, **bounds: Any) -> T:
-    """A field of a config dataclass; the arguments are those of `Meaning`, and within=(low, high) gives both bounds."""
+    """Declare a field of a config dataclass. Args: those of `Meaning`; within=(low, high) gives both bounds."""
     if within:
         bounds |= {"at_least": within[0], "at_most": within[1]}
     said = {"meaning": Meaning(what, unit, **bounds)}
@@ -123,12 +123,12 @@ def setting(default: T, what: str, unit: str = "", within: tuple[float, float] |
 
 
 def part(factory: Callable[[], T], what: str) -> T:
-    """A field that holds a config dataclass of its own."""
+    """Declare a field that holds a config dataclass of its own."""
     return field(default_factory=factory, metadata={"meaning": Meaning(what)})
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
-    """A rule of its own, such as one that joins several fields. Raises: ValueError with the checker's words."""
+    """Check a rule, such as one that joins several fields. Raises: ValueError with the checker's words."""
     if not holds:
         raise ValueError(f"{key} = {list(given) if isinstance(given, tuple) else given}: allowed {allowed}")
 
@@ -146,7 +146,7 @@ def check(config: Any, prefix: str = "") -> None:
 
 
 def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
-    """A config dataclass with some of its values replaced; parts are given as nested mappings.
+    """Build a config dataclass with some of its values replaced; parts are given as nested mappings.
 
     Numbers may be given as text and lists stand for tuples, as YAML and command lines have them.
 
@@ -181,7 +181,7 @@ def _keys(config: Any, prefix: str) -> Iterator[str]:
 
 
 def _meant(name: str, config: Any, prefix: str) -> str:
-    """The key of the whole tree that is most like a name, as the end of a sentence; "" if none is."""
+    """Suggest the key of the whole tree that is most like a name, as the end of a sentence; "" if none is."""
     keys: dict[str, str] = {}
     for key in sorted(_keys(config, prefix), key=lambda key: key.count(".")):
         last = key.rpartition(".")[2]
@@ -207,7 +207,7 @@ def _built(default: T, values: Mapping[str, Any], prefix: str) -> T:
 
 
 def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> Any:
-    """A plain value as the type of its field. Args: said: of the field. Raises: ValueError naming the key."""
+    """Convert a plain value to the type of its field. Args: said: of the field. Raises: ValueError naming the key."""
     if get_origin(hint) in (Union, types.UnionType):
         if given is None:
             return None
@@ -232,7 +232,7 @@ def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> 
 
 
 def _scalar(given: Any, hint: Any, key: str, said: Meaning) -> Any:
-    """A number, text or switch as the type of its field."""
+    """Convert a number, text or switch to the type of its field."""
     if hint is bool:
         word = str(given).lower()
         require(word in (*TRUE, *FALSE), key, given, "true or false")

@@ -109,13 +109,13 @@ class DQNAgent:
             self.learn(self.config.updates_per_step)
 
     def _drawn(self, uniform: Array) -> torch.Tensor:
-        """What the relabelling makes of its random numbers, block by block: (S, calls, W m) -> (S, calls, m, any)."""
+        """Pass random numbers through the relabelling, block by block: (S, calls, W m) -> (S, calls, m, any)."""
         assert self._relabel is not None
         numbers = torch.from_numpy(uniform).to(self.device)
         return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, self._relabel.numbers))
 
     def _minibatches(self, most: int) -> Transition:
-        """n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with another goal.
+        """Draw n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with another goal.
 
         Their observations are the network's features already, (S, n, B, F): the map is the same for every update.
         """
@@ -134,7 +134,7 @@ class DQNAgent:
         return self.target.forward(features.view(agents, n * b, f))[0].view(agents, n, b, self.n_actions)
 
     def _td_target(self, batch: Transition) -> torch.Tensor:
-        """y of every transition, shape (S, n, B)."""
+        """Compute the target y of every transition, shape (S, n, B)."""
         c = self.config
         q_t = self._q_target(batch.s_t)
         if c.value_root:
@@ -175,7 +175,7 @@ class DQNAgent:
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The complete learning state. A new agent of the same config continues to the bit on one processor."""
+        """Return the complete learning state. A new agent of the same config continues to the bit on one processor."""
         tensors = {"online": self.online.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
         counts = {"steps": self.steps, "updates": self.updates}
         parts = {name: part.state_dict() for name, part in self._parts.items()}

@@ -20,7 +20,7 @@ def export(
     limits: tuple[NDArray[np.float64], NDArray[np.float64]],
     metadata: dict[str, Any],
 ) -> Policy:
-    """The greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
+    """Export the greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
 
     Args:
       network: gives layer sizes and input map. agent: index into `flat`.

@@ -21,7 +21,7 @@ class Relabel(Protocol):
     numbers: int
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """What the random numbers say, (..., B, W) -> (..., B, any). Drawn for many minibatches at once."""
+        """Turn uniform random numbers into goals, (..., B, W) -> (..., B, any), for many minibatches at once."""
         ...
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
@@ -54,7 +54,7 @@ class GoalRelabel:
         self._config, self._reward = config, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """A goal from the whole range, and d with the sign of its side, infinite where the goal need not be near."""
+        """Draw a goal from the whole range, and d with its sign, infinite where the goal may be anywhere."""
         goal = self._low + (self._high - self._low) * uniform[..., 0]
         return torch.stack([goal, _distance(self._config, uniform[..., 1])], dim=-1)
 
@@ -84,7 +84,7 @@ class ShiftRelabel:
         self._config, self._span, self._reward = config, span, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """An error before the step from the whole range, and d with its sign, infinite where it need not be near."""
+        """Draw an error before the step from the whole range, and d with its sign, infinite for any distance."""
         error = self._span * (2.0 * uniform[..., 0] - 1.0)
         return torch.stack([error, _distance(self._config, uniform[..., 1])], dim=-1)
 
@@ -128,7 +128,7 @@ class ProgramRelabel:
         self.numbers = 5 if preview else 3
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """x after the step, a setpoint, its distance from x (infinite: anywhere), next setpoint, its time."""
+        """Draw x after the step, a setpoint, its distance from x (infinite: anywhere), next setpoint, its time."""
         x = self._span * (2.0 * uniform[..., 0] - 1.0)
         parts = [x, self._spread(uniform[..., 1]), _distance(self._config, uniform[..., 2])]
         if self._preview:

@@ -103,12 +103,12 @@ class QNetwork:
         return views
 
     def with_weights(self, flat: torch.Tensor) -> QNetwork:
-        """The same network with other weights, shape (S', P)."""
+        """Return the same network with other weights, shape (S', P)."""
         matrix, offset = (self._matrix, self._offset) if self._mapped else (None, None)
         return QNetwork(flat, self.sizes, matrix, offset, self._basis)
 
     def features(self, observation: torch.Tensor) -> torch.Tensor:
-        """f = M observation + c; observation (S, ..., B, observations) -> (S, ..., B, F)."""
+        """Compute f = M observation + c; observation (S, ..., B, observations) -> (S, ..., B, F)."""
         if self._mapped:
             return torch.matmul(observation, self._matrix.T).add_(self._offset)
         return observation

@@ -76,7 +76,7 @@ class Policy:
         return np.asarray(self.q_values(observation).argmax(axis=-1))
 
     def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
-        """The greedy action itself: a pump rate in mL/s or a share of the largest, (N, O) -> (N,)."""
+        """Return the greedy action itself: a pump rate in mL/s or a share of the largest, (N, O) -> (N,)."""
         return self.actions[self.act(observation)]
 
 

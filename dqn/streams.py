@@ -43,7 +43,7 @@ class UniformStream:
         self._position = 0
 
     def take(self, calls: int) -> Any:
-        """What the block holds for the next calls, (S, n, ...), n = `calls` or as many as are left in the block."""
+        """Take the numbers of the next n calls, (S, n, ...), n = `calls` or as many as are left in the block."""
         if self._position == CALLS_PER_BLOCK:
             self._refill()
         start, self._position = self._position, min(self._position + calls, CALLS_PER_BLOCK)

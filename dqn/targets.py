@@ -6,7 +6,7 @@ __all__ = ["advantage_target", "compressed", "expanded", "huber_loss", "loss_gra
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
-    """y = r + gamma c max_a Q_target(s', a) (Mnih 2015).
+    """Compute y = r + gamma c max_a Q_target(s', a) (Mnih 2015).
 
     Args: r_t, continues: shape (S, B); q_t: target network at s', shape (S, B, A).
     Returns: shape (S, B).
@@ -30,7 +30,7 @@ def expanded(q: torch.Tensor, root: float) -> torch.Tensor:
 
 
 def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_tm1: torch.Tensor) -> torch.Tensor:
-    """y - alpha (max_a Q_target(s, a) - Q_target(s, a_tm1)): advantage learning (Baird 1999; Bellemare 2016, eq. 10).
+    """Compute y - alpha (max_a Q_target(s, a) - Q_target(s, a_tm1)): advantage learning (Baird 1999).
 
     The fixed point has the same greedy policy and the same maximum V; its gaps V - Q(s, a) are 1 / (1 - alpha) times
     those of Q-learning, so that an error of the network confuses fewer actions.

@@ -25,7 +25,7 @@ class GrowthLaw(Protocol):
     """Specific growth rate of suspended cells; the interface shared by training model and plant."""
 
     def specific_rate(self, substrate: Array) -> Array:
-        """mu in 1/min, shape (N,).
+        """Compute mu in 1/min, shape (N,).
 
         Args: substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
         Raises: nothing; parameters are checked where they are set, so the hot path stays bare.

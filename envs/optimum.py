@@ -53,7 +53,7 @@ class EpisodeOptimum:
 
 
 def solve_episode(config: EnvConfig, setpoint: float, spacing: float = SPACING) -> EpisodeOptimum:
-    """The least undiscounted cost of an episode of `config.episode_steps` steps at one setpoint, and how to reach it.
+    """Solve an episode of `config.episode_steps` steps at one setpoint for its least undiscounted cost.
 
     Args: config: the task; its actions and its integrator are used as they are. setpoint: OD. spacing: of log OD.
     """
@@ -114,7 +114,7 @@ class RelativeOptimum:
 def solve_relative(
     config: RelativeConfig, growth_share: float, steps: int, spacing: float = 1 / 256
 ) -> RelativeOptimum:
-    """The least sum of e^2 over `steps` steps at one growth share. Args: spacing: of the grid of e."""
+    """Minimise the sum of e^2 over `steps` steps at one growth share. Args: spacing: of the grid of e."""
     levels = config.levels()
     reach = config.largest_error + 1.0
     error = np.linspace(-reach, reach, round(2.0 * reach / spacing) + 1)

@@ -27,7 +27,7 @@ class Output:
 
 
 def outputs_of(text: str | None) -> tuple[Output, ...]:
-    """The outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed ones."""
+    """Parse the outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed ones."""
     found = []
     for part in (text or "").split(",") if text else []:
         said = GIVEN.fullmatch(part.strip())

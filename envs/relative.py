@@ -47,17 +47,17 @@ class RelativeConfig:
         check(self, "env")
 
     def levels(self) -> Array:
-        """The action grid v, shares of the largest pump rate, shape (A,)."""
+        """Return the action grid v, shares of the largest pump rate, shape (A,)."""
         return np.linspace(0.0, 1.0, self.n_actions)
 
 
 def relative_reward(error: Any) -> Any:
-    """r = -e'^2 of the error reached, NumPy or tensor."""
+    """Compute r = -e'^2 of the error reached, NumPy or tensor."""
     return -error * error
 
 
 def nearest_level(error: Array, growth_share: Array, n: int = 17) -> NDArray[np.intp]:
-    """The myopic law as an index: the level nearest to clip(e + s, 0, 1), the lower of two that are as near."""
+    """Choose the index of the level nearest to clip(e + s, 0, 1), the lower of two that are as near (myopic law)."""
     wanted = np.clip(error + growth_share, 0.0, 1.0) * (n - 1)
     return np.asarray(np.ceil(wanted - 0.5).clip(0, n - 1), dtype=np.intp)
 

@@ -26,7 +26,7 @@ SCORED_OD = (0.1, 1.1)
 
 
 def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
-    """n pump rates in mL/s, equally spaced from 0 to `maximum`, shape (n,).
+    """Return n pump rates in mL/s, equally spaced from 0 to `maximum`, shape (n,).
 
     Raises: ValueError if n < 2 or `maximum` is not positive.
     """
@@ -88,12 +88,12 @@ class EnvConfig:
         check(self, "env")
 
     def pump_rates(self) -> Array:
-        """The action grid in mL/s, shape (A,)."""
+        """Return the action grid in mL/s, shape (A,)."""
         return pump_rates(self.n_actions, self.max_pump_rate)
 
 
 def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
-    """f with x(t + control period) = f x(t) for a pump rate held over the period, shape of `rates`.
+    """Compute f with x(t + control period) = f x(t) for a pump rate held over the period, shape of `rates`.
 
     The model is linear in x, so the configured integrator, run once from x = 1 with all its sub-steps, gives f
     exactly: for Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
@@ -110,7 +110,7 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
 
 
 def tracking_reward(od: T, setpoint: T) -> T:
-    """r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
+    """Compute r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
 
     Args: od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
     Returns: shape of the broadcast. Raises: nothing.

@@ -163,7 +163,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Space of one copy's observations."""
 
     def _prepare(self) -> None:
-        """What a task computes once."""
+        """Compute what a task needs once."""
 
     @abstractmethod
     def _begun(self, numbers: Array) -> Array:
@@ -226,7 +226,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return names.index(name)
 
     def _checked(self, name: str, value: Any) -> Array:
-        """A start that a reset was given, (N,). Raises: ValueError."""
+        """Check a start that a reset was given, (N,). Raises: ValueError."""
         space, column = self.observations(self.config), self._column(name)
         low, high = float(space.low[column]), float(space.high[column])
         given = np.asarray(value, dtype=np.float64)

@@ -46,7 +46,7 @@ def _line(name: str, what: str) -> str:
 
 
 def page() -> Iterator[str]:
-    """What is printed without a command, line by line."""
+    """Describe all commands, line by line, for a call without a command."""
     yield USAGE
     others = tuple(name for name in names() if not any(name in group for group in KINDS.values()))
     for kind, group in {**KINDS, **({"Others": others} if others else {})}.items():

@@ -17,7 +17,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
 
 
 def _schema(cfg: DictConfig) -> BenchmarkConfig:
-    """A controller's config is that of its kind, and so is a composition's."""
+    """Use for each controller and composition the config of its kind."""
     return BenchmarkConfig(
         controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
         compositions={str(name): registry.config(str(c.kind), registry.SHARE) for name, c in cfg.compositions.items()},

@@ -95,7 +95,7 @@ def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfi
 
 
 def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibratePairConfig) -> Curve:
-    """The curve of a species. Raises: UserError for too few temperatures."""
+    """Fit the growth curve of a species. Raises: UserError for too few temperatures."""
     t = np.array([p.temperature for p in points])
     apart = np.unique(np.round(t)).size
     if apart < FEWEST:

@@ -119,7 +119,7 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
 
 
 def report(fit: PumpFit, found: list[Series]) -> str:
-    """What was found, for a person to judge."""
+    """Describe the fit for a person to judge."""
     c = fit.calibration
     lines = [f"{'asked s':>8} {'doses':>6} {'mL/dose':>9} {'fitted':>9}"]
     lines += [

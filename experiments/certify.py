@@ -63,7 +63,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
 
 
 def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> str:
-    """The certificate, here and where else it goes; summary, figure and page. Returns: what could not be written."""
+    """Write the certificate, its other copy, summary, figure and page. Returns: what could not be written."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
@@ -103,7 +103,7 @@ def _place(config: CertifyConfig, source: Path) -> Path | None:
 
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
-    """What a page shows: the verdict, every requirement, and a row per case."""
+    """Build what a page shows: the verdict, every requirement, and a row per case."""
     kept = ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
     cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
     heads = (*content["observation"][:2], "from action", "to action")
@@ -113,7 +113,7 @@ def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[
 
 
 def _row(loop: Any, proof: Proof) -> dict[str, Any]:
-    """A case over the strips that the pump can hold; OD: of the strip in their middle."""
+    """Summarise a case over the strips that the pump can hold; OD: of the strip in their middle."""
     held = np.flatnonzero(proof.holdable)
     middle = held[np.abs((loop.low + loop.high)[held] / 2.0 - np.mean((loop.low[0], loop.high[-1]))).argmin()]
     return {

@@ -63,7 +63,7 @@ class MarkConfig:
 
 
 def _minute_now(folder: Path, stored: Any) -> float:
-    """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
+    """Return the minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
     from hardware.family import elapsed_s, family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
@@ -80,7 +80,7 @@ def _minute_now(folder: Path, stored: Any) -> float:
 
 
 def _latest(folder: Path, stored: Any) -> float:
-    """The minute up to which a run has come."""
+    """Return the minute up to which a run has come."""
     try:
         return _minute_now(folder, stored)
     except frame.UserError:
@@ -121,7 +121,7 @@ def _body(config: MarkConfig, folder: Path) -> None:
 
 
 def _quoted(argument: str) -> str:
-    """A text as it was typed, whatever Hydra's grammar would make of it."""
+    """Return a text as it was typed, whatever Hydra's grammar would make of it."""
     key, _, value = argument.partition("=")
     if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
         return argument

@@ -32,7 +32,7 @@ class ReportConfig:
 
 
 def _summary(run: Path) -> Any:
-    """What a run found. Raises: frame.UserError for a file that holds no JSON, or half characters, or no end."""
+    """Read what a run found. Raises: frame.UserError for a file that holds no JSON, or half characters, or no end."""
     try:
         summary = json.loads((run / "summary.json").read_text("utf-8"))
         json.dumps(summary, ensure_ascii=False).encode()
@@ -94,7 +94,7 @@ def compare(folder: Path) -> Path:
 
 
 def _result(job: sweep.Job) -> Result:
-    """A job with what it found, as the page takes it. Overrides are those of the command line, key by key."""
+    """Build a job's result for the page. Overrides are those of the command line, key by key."""
     overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
     if preset := overrides.pop("hparams_search", None):  # a run of the same values is no search
         path = presets.ROOT / "hparams_search" / f"{preset}.yaml"
@@ -110,7 +110,7 @@ def _result(job: sweep.Job) -> Result:
 
 
 def find(name: str, root: Path = Path("runs")) -> Path:
-    """A run folder from its path or `latest`. Raises: frame.UserError naming what to give."""
+    """Find a run folder by its path or `latest`. Raises: frame.UserError naming what to give."""
     if name != "latest":
         if not Path(name).is_dir():
             raise frame.UserError(f"run={name}: no such folder; give the folder of a finished run")

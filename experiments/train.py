@@ -16,7 +16,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 
 def _schema(cfg: DictConfig) -> TrainConfig:
-    """An environment's config is that of its kind."""
+    """Use for each environment the config of its kind."""
     return TrainConfig(env=env_schema(str(cfg.env.get("kind", "density"))))
 
 

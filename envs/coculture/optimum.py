@@ -66,7 +66,7 @@ class Transitions:
 
 
 def _corners(axes: tuple[Array, Array, Array], state: Array) -> tuple[NDArray[np.int32], Array]:
-    """The eight grid points around states (..., 3) and their weights, (..., 8) each."""
+    """Find the eight grid points around states (..., 3) and their weights, (..., 8) each."""
     cells = [_cell(state[..., k], axis) for k, axis in zip((1, 2, 0), axes, strict=True)]
     index, weight = np.empty((*state.shape[:-1], 8), dtype=np.int32), np.empty((*state.shape[:-1], 8))
     for corner in range(8):
@@ -86,7 +86,7 @@ def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
 
 @lru_cache(maxsize=4)
 def transitions(config: CocultureConfig, grid: Grid = Grid()) -> Transitions:
-    """The model on a grid; kept for the last few configs."""
+    """Tabulate the model on a grid; kept for the last few configs."""
     from scipy.sparse import csr_array
 
     axes = grid.axes(config)

@@ -72,8 +72,9 @@ class SpeciesConfig:
 
 @dataclass(frozen=True)
 class PigmentConfig:
-    """Pigment of the second species, whose light is counted: f' = g p - D f with its production g behind temperature,
+    """Pigment of the second species: f' = g p - D f.
 
+    Its light is counted. The production g lags behind temperature:
     g' = follow (g_ss(T) - g(t - delay)),  g_ss(T) = max(least, sum_k c_k (T - centre)^k),  g >= least.
     """
 
@@ -148,7 +149,7 @@ class PairConfig:
         return np.asarray(rates[..., 1] - rates[..., 0])
 
     def production(self, temperature: Array | float) -> Array:
-        """What pigment's production comes to at temperatures in degC, counts per hour and OD, same shape."""
+        """Compute the pigment's production at temperatures in degC, counts per hour and OD, same shape."""
         return self.pigment.steady(np.clip(np.asarray(temperature, dtype=np.float64), *self.temperatures))
 
     @property
@@ -205,7 +206,7 @@ class PairConfig:
 
 
 def named_pair(name: str) -> PairConfig:
-    """A pair by the name of its preset in conf/strains, from a YAML file like these, or from a folder with pair.yaml.
+    """Load a pair by its preset in conf/strains, from a YAML file like these, or from a folder with pair.yaml.
 
     Raises: ValueError naming the presets, or the file and what is wrong with it.
     """

@@ -78,7 +78,7 @@ class CocultureConfig:
         return self.pair.temperatures if self.temperatures is None else self.temperatures
 
     def targets(self) -> Array:
-        """The temperatures one can choose, degC, shape (A,)."""
+        """List the temperatures of the actions, degC, shape (A,)."""
         return np.linspace(*self.span, self.n_actions)
 
     @property

@@ -139,7 +139,7 @@ def _limit(result: Calibration, config: IdentifyConfig) -> float:
 
 
 def _free_run(inside: Series, method: str) -> Fit | None:
-    """The paper's fit; None where there is none and it was not asked for. Raises: NotIdentifiable."""
+    """Run the paper's fit; None where it fails and was not asked for. Raises: NotIdentifiable."""
     try:
         return fit(inside)
     except NotIdentifiable:

@@ -124,7 +124,7 @@ def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
 
 
 def fit(temperature: Array, value: Array, sd: Array, degree: int, centre: float = 0.0) -> Curve:
-    """The weighted least-squares polynomial through points (K,), of a degree less than their number."""
+    """Fit the weighted least-squares polynomial to points (K,), of a degree less than their number."""
     powers = np.vander(temperature - centre, degree + 1)
     weighted = powers / sd[:, None]
     coefficients, *_ = np.linalg.lstsq(weighted, value / sd, rcond=None)

@@ -71,7 +71,7 @@ def _narrow(p: Parameter) -> bool:
 
 
 def cuts(clean: Series, a: int, b: int, length: float) -> list[tuple[int, int]]:
-    """[a, b) cut into equal pieces of about `length` min."""
+    """Cut [a, b) into equal pieces of about `length` min."""
     if b - a < 2:
         return []
     span = clean.time[b - 1] - clean.time[a]
@@ -94,7 +94,7 @@ def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
 
 
 def drifts(along: tuple[Segment, ...]) -> bool:
-    """True when tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
+    """Tell whether tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
 
     Growth that wanders is part of the model and mu its mean. Less certainty than for a warning: a window that may drift
     is not to be trusted (docs/records/calibration.md, The window, shows what either rule brings).

@@ -49,7 +49,7 @@ class Fit:
 
 
 def _basis(series: Series, used: NDArray[np.intp], with_tau: bool) -> Array:
-    """Derivatives of ln x at the rows `used` with respect to (mu, [1/tau], ln x_0), shape (m, p); ln x is linear."""
+    """Differentiate ln x at the rows `used` with respect to (mu, [1/tau], ln x_0), shape (m, p); ln x is linear."""
     elapsed, volume = series.time[used] - series.time[0], pumped_volume(series.time, series.pump_rate)[used]
     return np.column_stack([elapsed, *([-volume] if with_tau else []), np.ones(len(used))])
 

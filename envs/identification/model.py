@@ -54,7 +54,7 @@ class Parameter:
 
 
 def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | float, start_od: Array | float) -> Array:
-    """x of equation (5) at the rows' times, started at the first row; exact for u held between rows.
+    """Compute x of equation (5) at the rows' times, started at the first row; exact for u held between rows.
 
     Args:
       time: min, shape (n,) or (N, n). pump_rate: mL/s, same shape.

@@ -50,7 +50,7 @@ class NoiseModel:
 
     @classmethod
     def at(cls, z: Array) -> "NoiseModel":
-        """The points of z, shape (M, G, 7)."""
+        """Build the noise models of the points z, shape (M, G, 7)."""
         from scipy.special import ndtr
 
         p, dose, wander, memory, phi, late, again = np.moveaxis(z, -1, 0)
@@ -118,7 +118,7 @@ class _Student:
 
 
 def _fitted(z: Array, weight: Array) -> _Student:
-    """The proposal with the mean and the covariance of weighted points."""
+    """Fit the proposal: mean and covariance of weighted points."""
     centre = np.sum(weight[..., None] * z, axis=1)
     away = z - centre[:, None]
     spread = (weight[..., None] * away).swapaxes(-1, -2) @ away + LEAST_SPREAD**2 * np.eye(z.shape[-1])

@@ -137,7 +137,7 @@ class _Filter:
         return np.asarray(-self._both[:, 4:])
 
     def rows(self) -> Iterator[_Step]:
-        """The innovations of every row, 0 where there is no reading."""
+        """Iterate over the innovations of every row, 0 where there is no reading."""
         b, both, late = self.batch, self._both, np.zeros(self.shape)
         everyone = np.all(b.reading, axis=0)
         for i in range(b.dt.shape[1]):
@@ -156,11 +156,11 @@ class _Filter:
             late = b.each[:, i, None] + self.cells.mixing * late
 
     def ratio(self, i: int) -> Array:
-        """r of row i, shape (M, G)."""
+        """Return r of row i, shape (M, G)."""
         return np.asarray(np.sqrt(self.cells.p + self._alike * self._level[:, i, None]))
 
     def decay(self, i: int) -> Array:
-        """a of row i, shape (M, G)."""
+        """Return a of row i, shape (M, G)."""
         return np.asarray(np.exp(-self.batch.dt[:, i, None] / self.cells.memory))
 
     def _move(self, i: int) -> None:
@@ -175,7 +175,7 @@ class _Filter:
         covariance[2, 2] += self._fresh[1]
 
     def _meet(self, decay: Array) -> None:
-        """What a row keeps of w and v, and the variance of what comes to them."""
+        """Prepare what a row keeps of w and v, and the variance of what is added to them."""
         kept = np.stack([np.ones(self.shape), decay, self.cells.phi, np.ones(self.shape)])
         self._kept[:, :4] = kept[:, None] * kept
         self._kept[:, 4:] = kept[:, None]
@@ -356,7 +356,7 @@ def _averaged(batch: _Batch, rounds: tuple[int, ...], seed: int) -> tuple[NoiseM
 
 
 def _mean_growth(batch: _Batch, solved: _Solved, sigma: Array) -> tuple[Array, Array]:
-    """mu + S_end/L and its sd, (M, G): linear in the coefficients, as S of each column has the same gains."""
+    """Compute mu + S_end/L and its sd, (M, G): linear in the coefficients, as S of each column has the same gains."""
     span = batch.span[:, None]
     towards = -solved.drift[..., 1:] / span[..., None]
     towards[..., MU] += 1.0 / batch.scale[:, None, MU]
@@ -412,7 +412,7 @@ def _traces(batch: _Batch, cells: NoiseModel) -> _Traces:
 
 
 def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
-    """Readings that all others contradict: deletion residual beyond 4.5 robust sd, the largest of five neighbours.
+    """Find readings that all others contradict: deletion residual beyond 4.5 robust sd, the largest of five neighbours.
 
     With e = ln y - X b and V its covariance, reading i differs from what all others say about it by (V^-1 e)_i sd's,
     divided by the root of (V^-1)_ii; a disturbance smoother at the mean noise model gives both (de Jong 1989,

@@ -85,7 +85,7 @@ def _rows(rows: tuple[int, int]) -> str:
 
 
 def growth_alone(raw: Series) -> GrowthAlone | None:
-    """mu and the net growth of a recording that cannot tell tau; None without the readings for either.
+    """Fit mu and the net growth of a recording that cannot tell tau; None without the readings for either.
 
     Raises: ValueError when no trustworthy readings are left.
     """

@@ -69,7 +69,7 @@ class Series:
         return Series(self.time[s], self.od[s], self.pump_rate[s], self.row[s])
 
     def rejecting(self, bad: Mask) -> Series:
-        """The same with the readings of `bad`, shape (n,), taken out (nan); time and pump stay."""
+        """Return the series without the readings of `bad`, shape (n,), which become nan; time and pump stay."""
         return Series(self.time, np.where(bad, np.nan, self.od), self.pump_rate, self.row)
 
 
@@ -107,7 +107,7 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
 
 
 def merged(series: Series) -> Series:
-    """The same with rows of half a minute and less merged, where there are more than a week of minutes has.
+    """Merge rows of half a minute and less, where there are more rows than a week has minutes.
 
     A merged row stands at the middle one of its rows, with the median of its readings; the pump's volume is kept.
     """
@@ -138,7 +138,7 @@ def row_spans(rows: NDArray[np.int64]) -> str:
 
 
 def _slow_log_od(series: Series) -> Array:
-    """r of the module's docstring, shape (n,), nan where there is no reading."""
+    """Compute r of the module's docstring, shape (n,), nan where there is no reading."""
     volume = pumped_volume(series.time, series.pump_rate)
     log_od = np.log(np.maximum(series.od, OD_FLOOR))
     lag = 5
@@ -161,7 +161,7 @@ def _slow_log_od(series: Series) -> Array:
 
 
 def running_median(values: Array, width: int) -> Array:
-    """Running median over `width` (odd) neighbours ignoring nan, shape (n,); nan only where all are."""
+    """Take the running median over `width` (odd) neighbours ignoring nan, shape (n,); nan only where all are."""
     half = width // 2
     padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
     windows = np.sort(sliding_window_view(padded, width), axis=1)  # nan last
@@ -237,7 +237,7 @@ def _check_left(series: Series) -> None:
 
 
 def _frozen(od: Array) -> Mask:
-    """True for the repeats (not the first) in a stretch of equal readings of at least FROZEN_ROWS."""
+    """Mark the repeats (not the first) in a stretch of equal readings of at least FROZEN_ROWS."""
     frozen = np.zeros(len(od), dtype=np.bool_)
     for a, b in runs(np.concatenate([[False], od[1:] == od[:-1]])):
         if b - a + 1 >= FROZEN_ROWS:

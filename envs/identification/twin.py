@@ -73,7 +73,7 @@ class Twin:
 
 
 def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
-    """The plant behind all trustworthy rows of a calibrated recording, with a knot about every `knot_every_min` min.
+    """Fit the plant behind all trustworthy rows of a calibrated recording, a knot about every `knot_every_min` min.
 
     Of a recording of more than a week it is that of the window.
 
@@ -137,7 +137,7 @@ class _Rows:
         return np.asarray(sums[self.full] / self.count[:, None])
 
     def grown(self, k: Array) -> Array:
-        """g of the module's docstring, between readings on a straight line, shape (n,)."""
+        """Compute g of the module's docstring, between readings on a straight line, shape (n,)."""
         at = np.flatnonzero(self.seen)
         return np.asarray(np.interp(np.arange(len(self.seen)), at, (self.log_od + self.pumped @ k)[at]))
 
@@ -147,12 +147,12 @@ class _Rows:
 
 
 def _summed(steps: Array) -> Array:
-    """The sum of what all earlier rows add, shape (n, J)."""
+    """Sum what all earlier rows add, shape (n, J)."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps[:-1], axis=0)])
 
 
 def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """A line plus a random walk at P points from n linear observations of it, averaged over the walk's likely sizes.
+    """Fit a line plus a random walk at P points to n linear observations, averaged over the walk's likely sizes.
 
     Args: at_h: hours, (P,). mean: scale of the curve. seen: observations, (n,). towards: their weights on the points,
       (n, P). noise: covariance of their errors, (n, n).
@@ -178,7 +178,7 @@ def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) 
 
 
 def _inverse_tau(result: Calibration, at: Array) -> tuple[Array, Array, bool]:
-    """k at times in min, shape (J,), its covariance (J, J), and whether its drift could be told.
+    """Estimate k at times in min, shape (J,), its covariance (J, J), and whether its drift is identifiable.
 
     Before the first and after the last segment with a tau of its own k stays.
     """
@@ -201,7 +201,7 @@ def _inverse(tau: Parameter) -> tuple[float, float]:
 
 
 def _growth(rows: _Rows, k: Array, k_cov: Array, noise: Noise, mean: float) -> tuple[Array, Array]:
-    """mu at the knots, shape (J,), and its covariance, that of k included; rows count as means of blocks."""
+    """Estimate mu at the knots, shape (J,), and its covariance, that of k included; rows count as means of blocks."""
     walked = rows.means(_summed(((noise.dose_cv * rows.doses(k)) ** 2)[:, None]))[:, 0]
     reading = np.hypot(noise.floor / np.where(rows.seen, rows.part.od, 1.0), noise.relative)
     longer = (1.0 + noise.lag1) / (1.0 - noise.lag1)

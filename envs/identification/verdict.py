@@ -24,7 +24,7 @@ AGAIN = "calibrate again shortly before the run, or fly the policy that ships (p
 def judged(
     result: Calibration, limit: float, doubts: tuple[tuple[str, str], ...] = ()
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict on a fit, and all that speaks against it, the gravest first.
+    """Judge a fit: the verdict, and all that speaks against the fit, the gravest first.
 
     Args: limit: of predictions, PMSE in %. doubts: about the recording, each with what to do.
     """
@@ -39,7 +39,7 @@ def judged(
 
 
 def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
-    """(what is wrong, what to do about it)."""
+    """Yield pairs (what is wrong, what to do about it)."""
     mu, tau = result.mu, result.tau
     for name, value, (low, high) in (("mu", mu.value, PLAUSIBLE_MU), ("tau", tau.value, PLAUSIBLE_TAU)):
         if not low <= value <= high:

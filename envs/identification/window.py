@@ -53,7 +53,7 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
 
 
 def longest(screened: Screened) -> Window:
-    """The stretch with most readings."""
+    """Choose the stretch with most readings."""
     return max(screened.stretches, key=lambda s: np.isfinite(screened.series.od[s[0] : s[1]]).sum())
 
 

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def along(knots_min: Sequence[float], knots: Sequence[float], mean: float, age_min: Array) -> Array:
-    """The value at each age over `mean`, shape (N,): linear between knots, the nearest knot's beyond them.
+    """Interpolate the value at each age over `mean`, shape (N,): linear between knots, constant beyond them.
 
     Args: knots_min, knots: ages in min and values; none of them means a constant, 1. mean: > 0 where there are knots.
       age_min: min, shape (N,).
@@ -23,6 +23,6 @@ def along(knots_min: Sequence[float], knots: Sequence[float], mean: float, age_m
 
 
 def check_knots(key: str, knots_min: Sequence[float], knots: Sequence[float]) -> None:
-    """Raises: ValueError unless ages rise and each has a value. Args: key: of the values."""
+    """Check that ages rise and each has a value. Args: key: of the values. Raises: ValueError."""
     fits = len(knots) == len(knots_min) and all(a < b for a, b in pairwise(knots_min))
     require(fits, key, knots, f"one value for each of knots_min = {list(knots_min)}, which must rise")

@@ -119,7 +119,7 @@ class Culture:
         self.species_factor = np.ones((self._n, len(species)))
 
     def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
-        """A new culture in balance with the medium it grew from.
+        """Start a new culture in balance with the medium it grew from.
 
         Args: OD and degC, scalar or shape (N,). share: of the second species, as `od`; None = as drawn.
         """
@@ -207,7 +207,7 @@ class Culture:
         return np.stack([phi(temperature) for phi in self._responses], axis=1)
 
     def _relative_rate(self, age_min: Array) -> Array:
-        """What temperature, drift, stirring and both factors now make of the growth laws' rates, shape (N, S)."""
+        """Combine temperature, drift, stirring and both factors into a factor of the growth rates, shape (N, S)."""
         g = self.config
         course = along(g.knots_min, g.knots_mu, g.mu, age_min)
         drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course

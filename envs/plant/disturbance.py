@@ -20,7 +20,7 @@ def add(name: str, disturb: Disturbance) -> None:
 
 
 def named(name: str) -> Disturbance:
-    """The disturbance of a name. Raises: ValueError naming those there are."""
+    """Find a disturbance by its name. Raises: ValueError naming those there are."""
     allowed = f"{', '.join(_known)}" if _known else "none; extend=FILE.py brings them (docs/extending.md)"
     require(name in _known, "plant.disturbances", name, allowed)
     return _known[name]

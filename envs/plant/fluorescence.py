@@ -88,7 +88,7 @@ class Fluorescence:
         self._last = np.full(producers.size, np.nan)
 
     def new_minute(self, temperature: Array) -> None:
-        """A minute begins at `temperature`, degC, shape (N,): production takes its step."""
+        """Begin a minute at `temperature`, degC, shape (N,): production takes its step."""
         pigment = self._pair.pigment
         steady = self._pair.production(temperature)
         wanted = self.production + pigment.follow_per_h / 60.0 * (steady - self._past[0])
@@ -109,7 +109,7 @@ class Fluorescence:
         self.pigment = (self.pigment * kept * (1.0 - gone) + made) * concentrated
 
     def apparent(self, od: Array, minutes: float) -> Array:
-        """What a noise-free sensor would show, counts, shape (N,).
+        """Compute what a noise-free sensor would show, counts, shape (N,).
 
         Args: od: of all cells, shape (N,); minutes: age of the calibration, min.
         """

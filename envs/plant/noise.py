@@ -24,7 +24,7 @@ def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Genera
 
 
 def spread(rngs: Streams, mean: Array | float, cv: Array | float) -> Array:
-    """mean (1 + cv z) with z standard normal cut at three sigma, one draw per stream, shape (N,)."""
+    """Draw mean (1 + cv z) with z standard normal cut at three sigma, one per stream, shape (N,)."""
     z = np.clip([rng.standard_normal() for rng in rngs], -3.0, 3.0)
     return np.asarray(mean * (1.0 + cv * z), dtype=np.float64)
 
@@ -55,7 +55,7 @@ class Tape:
         self._uniform = np.empty((len(rngs), self.BLOCK, uniforms))
 
     def next(self) -> tuple[Array, Array]:
-        """The next row: (standard normals, uniforms on [0, 1)), shapes (normals, N) and (uniforms, N)."""
+        """Draw the next row: (standard normals, uniforms on [0, 1)), shapes (normals, N) and (uniforms, N)."""
         if self._row == self.BLOCK:
             for i, rng in enumerate(self._rngs):
                 self._normal[i] = rng.standard_normal((self.BLOCK, self._sizes[0]))

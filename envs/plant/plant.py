@@ -66,7 +66,7 @@ class PlantConfig:
 
 
 def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
-    """A plant whose species are of another pair: each grows in proportion to its new curve as it did to its old one."""
+    """Give a plant the species of another pair: each grows in proportion to its new curve as it did to its old one."""
     if pair == config.pair:
         return config
     by = pair.rates(REFERENCE_TEMPERATURE) / config.pair.rates(REFERENCE_TEMPERATURE)
@@ -133,7 +133,7 @@ class Plant:
         temperature: Array | float | None = None,
         share: Array | float | None = None,
     ) -> None:
-        """A new culture at the waste tube's level, in balance with the medium it grew from.
+        """Start a new culture at the waste tube's level, in balance with the medium it grew from.
 
         Args:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
@@ -256,7 +256,7 @@ class Plant:
         return np.asarray((self.culture.biomass * grown * (1.0 if continuous else np.exp(-dose))).sum(axis=-1))
 
     def at_rest(self, minutes: float, feed_s: Array | float) -> tuple[Array, Array]:
-        """What one mean dose of `feed_s` s takes off ln x, and the share of it that growth makes up for, each (N,).
+        """Compute what one mean dose of `feed_s` s takes off ln x, and the share that growth makes up for, each (N,).
 
         Args: minutes: between two doses. As `expected_od`, of this moment.
         """

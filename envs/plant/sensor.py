@@ -66,7 +66,7 @@ def counts_from_od(od: Array, blank: Array | float) -> Array:
 
 
 def od_from_counts(raw: Array, blank: Array | float) -> Array:
-    """The device's own formula, OD = 1.833 R + 0.226 R^2 with R = log10(blank / raw), raw > 0."""
+    """Convert counts by the device's own formula, OD = 1.833 R + 0.226 R^2 with R = log10(blank / raw), raw > 0."""
     ratio = np.log10(blank / raw)
     return np.asarray(LINEAR * ratio + QUADRATIC * ratio * ratio)
 
@@ -104,7 +104,7 @@ class OdSensor:
         self._last = np.full(n, np.nan)
 
     def apparent(self, od: Array, wall: Array, minutes: float) -> Array:
-        """What a noise-free sensor would show, OD, shape (N,).
+        """Compute what a noise-free sensor would show, OD, shape (N,).
 
         Args:
           od: suspended biomass in the light path, shape (N,); wall: biomass on the wall, OD-equivalent, shape (N,).

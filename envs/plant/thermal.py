@@ -55,7 +55,7 @@ class Thermal:
         self._ripple = np.zeros(self._n)
 
     def set_target(self, target: Array | float) -> None:
-        """New target of the thermostat, degC, scalar or shape (N,); nan leaves it."""
+        """Set the target of the thermostat, degC, scalar or shape (N,); nan leaves it."""
         wanted = np.broadcast_to(np.asarray(target, dtype=np.float64), (self._n,))
         self.target = np.where(np.isnan(wanted), self.target, wanted)
 
@@ -79,5 +79,5 @@ class Thermal:
         self.mean = self.temperature - 0.5 * rise * share
 
     def read(self) -> Array:
-        """The thermometer's value, degC, shape (N,); its ripple changes every minute."""
+        """Read the thermometer, degC, shape (N,); its ripple changes every minute."""
         return np.asarray(self.temperature + self.offset + self.config.ripple_c * self._ripple)

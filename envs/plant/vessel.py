@@ -81,7 +81,7 @@ class Vessel:
         self.reset()
 
     def reset(self) -> None:
-        """Filled to the waste tube."""
+        """Fill the vial to the waste tube."""
         self.volume_ml: Array = self._tube_ml.copy()
         self.overflowed: Mask = np.zeros(self._tube_ml.size, dtype=bool)
 

@@ -22,7 +22,7 @@ PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the window, least-squar
 
 
 def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str, Any]:
-    """What summary.json holds; rows are [first, end), counted from 0; n_rejected counts readings within `rows`."""
+    """Build summary.json; rows are [first, end), counted from 0; n_rejected counts readings within `rows`."""
     row = result.screened.series.row
     return {
         "verdict": asdict(result.verdict),
@@ -63,7 +63,7 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
 
 
 def refusal(error: NotIdentifiable, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
-    """The line that ends a refused calibration, and what summary.json holds of it.
+    """Build the line that ends a refused calibration, and its summary.json.
 
     A doubt about the recording comes first: who counts the wrong pump has nothing else to record.
     """
@@ -114,7 +114,7 @@ def _drift(d: Drift | None) -> dict[str, Any] | None:
 
 
 def environment_yaml(result: Calibration, source: str) -> str:
-    """The environment with the fitted mu and tau, every value with its meaning, and where the two come from.
+    """Write the environment with the fitted mu and tau, the meaning of every value, and the source of the two.
 
     Raises: ValueError naming the value that no environment may have.
     """
@@ -134,7 +134,7 @@ def environment_yaml(result: Calibration, source: str) -> str:
 
 
 def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
-    """The result for a human, a dozen lines, the verdict first."""
+    """Describe the result for a person in a dozen lines, the verdict first."""
     mu, tau, v = result.mu, result.tau, result.validation
     first, end = result.window_rows
     lines = [
@@ -173,7 +173,7 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
 
 
 def _disturbances(result: Calibration) -> list[str]:
-    """What the bench adds to the model, from the estimate."""
+    """Describe the estimated disturbances of the bench."""
     if not result.sound:
         return []
     q = result.estimate.quality
@@ -189,7 +189,7 @@ def _disturbances(result: Calibration) -> list[str]:
 
 
 def _beside(result: Calibration) -> list[str]:
-    """The other method's pair."""
+    """Describe the pair of the other method."""
     free, found = result.free_run, result.estimate
     if result.method == "free_run":
         other = None if not result.sound or found.tau is None else (found.mu, found.tau, "prediction_error")

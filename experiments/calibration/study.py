@@ -26,7 +26,7 @@ Fitted = Calibration | str
 
 
 def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Array]:
-    """n recordings under the configured law: time (T,), OD and pump rate (n, T), mean growth rate (n,)."""
+    """Simulate n recordings under the configured law: time (T,), OD and pump rate (n, T), mean growth rate (n,)."""
     protocol, rng = config.protocol, np.random.default_rng(config.protocol.seed)
     if config.law == "open_loop":
         return recordings(protocol, OpenLoopLaw(protocol, n, rng).decide, rng, n)
@@ -35,7 +35,7 @@ def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Arr
 
 
 def _regulation(config: CalibrateConfig, n: int) -> Decide:
-    """The law as (minute, readings) -> rates; setpoints share the recording's time."""
+    """Build the law as (minute, readings) -> rates; setpoints share the recording's time."""
     times = np.linspace(0.0, 60.0 * config.protocol.hours, len(config.setpoints) + 1)[1:-1]
     everyone = np.ones(n, dtype=np.bool_)
     if config.law == "proportional":

@@ -28,7 +28,7 @@ LEFT = (
 
 
 def plant_of(found: Twin) -> PlantConfig:
-    """The twin as a plant. Raises: ValueError naming the value that no plant may have."""
+    """Convert the twin to a plant. Raises: ValueError naming the value that no plant may have."""
     volume = Bench.volume_ml  # flow and volume are one number to a recording: both stand in the file
     flow, knots = volume / (60.0 * found.tau.value), _numbers(found.knot_min)
     growth = GrowthConfig(mu=_mean(found.mu.value), knots_min=knots, knots_mu=_numbers(found.mu.value))
@@ -46,7 +46,7 @@ def plant_of(found: Twin) -> PlantConfig:
 
 
 def twin_yaml(found: Twin, source: str) -> str:
-    """The file's text: what differs from a plant's defaults, each value with its meaning and unit.
+    """Write the file's text: what differs from a plant's defaults, each value with its meaning and unit.
 
     Raises: ValueError naming the value that no plant may have.
     """
@@ -76,7 +76,7 @@ def twin_yaml(found: Twin, source: str) -> str:
 
 
 def yaml_line(entry: Entry) -> str:
-    """A value with its meaning and unit behind it."""
+    """Write a value with its meaning and unit behind it."""
     value = entry.value
     if isinstance(value, tuple):
         text = "[" + ", ".join(_plain(v) for v in value) + "]"
@@ -86,7 +86,7 @@ def yaml_line(entry: Entry) -> str:
 
 
 def _plain(value: float) -> str:
-    """A number as YAML reads it back: 5e-05 would be a string there."""
+    """Write a number so that YAML reads it back: 5e-05 would be a string there."""
     return np.format_float_positional(value, trim="0")
 
 

@@ -36,13 +36,13 @@ class EstimateBounds:
         return np.maximum(self.error, np.log1p(ratio) / self.full_pump)
 
     def error_at(self, estimate: Array, setpoint: float | None) -> Array:
-        """The same at an estimate of e and a setpoint; None: `error` alone. Shape of `estimate`."""
+        """Bound the error at an estimate of e and a setpoint; None: `error` alone. Shape of `estimate`."""
         if setpoint is None:
             return np.full_like(estimate, self.error)
         return self.error_bound(setpoint * np.exp(self.full_pump * estimate))
 
     def estimate(self, e: Array, side: Array, setpoint: float | None) -> Array:
-        """The farthest estimate to the side (1: above, -1: below) behind which e may stand, (N,); inverts `error_at`.
+        """Find the farthest estimate to the side (1: above, -1: below) that e allows, (N,); inverts `error_at`.
 
         With c the error of the OD and x = r exp(B e): above, ln(y) - ln(1 + c/y) = ln(x) gives y = (x + sqrt(x^2 +
         4 c x)) / 2; below, y + c = x. Where the constant bound is the larger one, it counts.

@@ -60,7 +60,7 @@ class Stored:
 
 
 def _up(value: Array, digits: float = 1e6) -> Array:
-    """Rounded up: what is written down holds, too."""
+    """Round up, so that the written number holds as well."""
     return np.asarray(np.ceil(value * digits) / digits)
 
 
@@ -79,7 +79,7 @@ def _case(proof: Proof) -> dict[str, Any]:
 
 
 def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, found: Certificate) -> dict[str, Any]:
-    """A certificate as it is written.
+    """Build a certificate as it is written.
 
     `band` is in ln(x / r) of a policy that sees the OD, else in e. `strips`: lowest and highest setpoint or growth
     share, and into how many equal strips it is cut; columns have an entry per strip.
@@ -261,7 +261,7 @@ def _short(failed: Sequence[Check], stored: Stored) -> list[str]:
 
 
 def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:
-    """What a certificate asks, of the bench of a run.
+    """Ask the questions of a certificate for the bench of a run.
 
     A policy of (error, growth share) meets another B; the nominal model of one of the OD has another volume.
     """

@@ -42,7 +42,7 @@ def figure(found: Certificate) -> Figure:
 
 
 def _polygons(ax: Axes, found: Certificate) -> None:
-    """The exact regions of the actions."""
+    """Draw the exact regions of the actions."""
     regions = found.regions
     first = np.unique(regions.owner, return_index=True)[1]
     corners = np.split(regions.edges[:, 0], first[1:])

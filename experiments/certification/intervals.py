@@ -49,7 +49,7 @@ class Pieces:
         return made
 
     def lowest(self, action: int) -> Array:
-        """The lowest state in which this action or a higher one may be chosen, (N,); inf where none is."""
+        """Find the lowest state in which this action or a higher one may be chosen, (N,); inf where none is."""
         return np.asarray(np.where(self.action >= action, self.low, np.inf).min(axis=1))
 
 
@@ -88,7 +88,7 @@ class Band:
 
 
 def images(pieces: Pieces, shift: Array, start: Array) -> Band:
-    """The limit of F^k(start), F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
+    """Iterate F^k(start) to its limit, F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
 
     F(I) is part of F(J) for I inside J. So if F(start) is part of the start, every F^k(start) is part of the one before
     it and is never left again; k periods are enough to reach it. Far out, where only the pieces without an end meet an
@@ -165,7 +165,7 @@ class Points:
     y: Array
 
     def pieces(self, action: Index, states: States, strips: int) -> Pieces:
-        """The states of each polygon in each strip: least and largest of `states` over its points.
+        """Find the states of each polygon in each strip: least and largest of `states` over its points.
 
         Args: action: of each polygon. states: (x, y) to [least, largest] state, each (K,); over a convex polygon both
         have their extremes at corners. strips: how many there are.
@@ -190,7 +190,7 @@ def crossings(regions: Regions, lines: Array) -> Points:
 
 
 def points_in_strips(regions: Regions, low: Array, high: Array) -> Points:
-    """The corners of every polygon cut to every strip low <= y <= high, (S,) each and rising."""
+    """Cut every polygon to every strip low <= y <= high, (S,) each and rising; return the corners."""
     corner = regions.edges[:, 0]
     first = np.searchsorted(high, corner[:, 1], "left")
     k, strip = _spread(first, np.searchsorted(low, corner[:, 1], "right"))

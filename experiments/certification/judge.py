@@ -38,7 +38,7 @@ class Check:
 
     @property
     def holds(self) -> bool:
-        """nan holds nothing."""
+        """Tell whether the requirement holds; nan holds nothing."""
         return self.value <= self.limit
 
     @property
@@ -98,7 +98,7 @@ class Certificate:
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
-        """What no policy holds, because pump or growth are too weak; a line for all cases that share a stretch."""
+        """List what no policy can hold, as pump or growth are too weak; one line for all cases that share a stretch."""
         found: dict[tuple[float, float], list[str]] = {}
         for proof in self.proofs:
             for stretch in _runs(self.question.loop, ~proof.holdable):
@@ -160,7 +160,7 @@ def _half(policy: Policy) -> int:
 
 
 def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Check]:
-    """What attacks on every case find: whether a band is left, and whether it is wider than it need be."""
+    """Attack every case: check whether a band is left, and whether it is wider than necessary."""
     once = {asked.loop.key(proof.case): proof for proof in reversed(proofs)} if trajectories else {}
     proofs = [proof for proof in proofs if proof in once.values()]
     found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs]
@@ -213,13 +213,13 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
 
 
 def _count(name: str, asked: Question, wrong: Mask) -> Check:
-    """Strips of which none may be."""
+    """Count strips that must not exist."""
     where = ", ".join(_place(asked, low, high) for low, high in _runs(asked.loop, wrong))
     return Check(name, float(wrong.sum()), 0.0, where)
 
 
 def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask, kind: str = SAFETY) -> Check:
-    """The largest value in some strips; nan, which is where nothing could be proven, is the worst."""
+    """Take the largest value in some strips; nan (nothing could be proven) is the worst."""
     if not where.any():
         return Check(name, 0.0, limit, kind=kind)
     at = int(np.where(where, np.where(np.isnan(value), np.inf, value), -np.inf).argmax())
@@ -235,7 +235,7 @@ def _place(asked: Question, low: float, high: float) -> str:
 
 
 def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Check]:
-    """The requirements that a policy fails at single setpoints, without an attack on its bands.
+    """List the requirements that a policy fails at single setpoints, without an attack on its bands.
 
     Of a policy of the OD along their lines, which need no polygons: another way to the same numbers.
     """

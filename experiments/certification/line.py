@@ -1,4 +1,6 @@
-"""A policy along a line of constant second coordinate: the same intervals as from polygons, by another way, in a
+"""A policy along a line of constant second coordinate.
+
+    The same intervals as from polygons, by another way, in a
 millisecond."""
 
 import numpy as np
@@ -42,7 +44,7 @@ def _along(network: Network, low: float, high: float, second: float) -> tuple[Ar
 
 
 def on_lines(network: Network, first: tuple[float, float], seconds: Array) -> tuple[Points, Index]:
-    """What `partition` and `points_in_strips` give, for strips without width: lines of constant second coordinate (S,).
+    """Replace `partition` and `points_in_strips` for strips without width: lines of constant second coordinate (S,).
 
     Returns: the two ends of every interval, whose number stands as their `polygon`; each interval's action.
     """

@@ -27,7 +27,7 @@ class Network:
 
     @classmethod
     def of(cls, policy: Policy) -> "Network":
-        """The network of a policy file."""
+        """Read the network of a policy."""
         weights = (policy.input_matrix.T, *policy.weights)
         biases = (policy.input_offset, *policy.biases)
         return cls(*(tuple(np.asarray(a, dtype=np.float64) for a in arrays) for arrays in (weights, biases)))

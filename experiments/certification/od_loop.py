@@ -14,7 +14,9 @@ NEAR_ZERO = 1e-9  # share of a setpoint that stands for an OD of zero
 
 @dataclass(frozen=True)
 class OdCase:
-    """What may differ from the nominal: growth rate and pump constant within +- `share` of it, changing from period
+    """Deviations from the nominal model.
+
+    Growth rate and pump constant lie within +- `share` of it, changing from period
     to period, and a reading within +- `noise` OD of the culture.
     """
 
@@ -45,7 +47,7 @@ class OdLoop:
         return np.full(self.low.size, self.mu * self.control_min)
 
     def at(self, setpoints: Array) -> "OdLoop":
-        """The same for single setpoints in place of strips."""
+        """Return the same loop for single setpoints in place of strips."""
         return replace(self, low=setpoints, high=setpoints)
 
     def shift(self, case: OdCase) -> Array:
@@ -58,7 +60,7 @@ class OdLoop:
         return np.broadcast_to(change, (self.low.size, *change.shape))
 
     def range(self, case: OdCase) -> Array:
-        """The start as d, for every setpoint of each strip, (S, 2)."""
+        """Return the start as d, for every setpoint of each strip, (S, 2)."""
         return np.log(np.stack([self.start[0] / self.high, self.start[1] / self.low], axis=1))
 
     def seen(self, case: OdCase) -> tuple[Array, Array]:
@@ -70,7 +72,7 @@ class OdLoop:
         return lambda y, r: (_log((y - case.noise) / r), _log((y + case.noise) / r))
 
     def law(self, case: OdCase) -> Pieces:
-        """The one-line law of the nominal model: the rate nearest to tau (mu + ln(y / r) / h)."""
+        """Apply the one-line law of the nominal model: the rate nearest to tau (mu + ln(y / r) / h)."""
         middle = (self.rates[1:] + self.rates[:-1]) / 2.0
         reading = np.exp(self.control_min * (middle / self.tau - self.mu))  # y / r between two rates
         off = case.noise / self.low[:, None]
@@ -92,11 +94,11 @@ class OdLoop:
         return case
 
     def in_od(self, case: OdCase, half_width: float) -> float:
-        """A half-width, which is in OD."""
+        """Return a half-width, which is in OD already."""
         return half_width
 
     def attack(self, case: OdCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """What the policy is shown, (N, 2), and what a period adds to d for each action then, (N, A).
+        """Attack: what the policy is shown, (N, 2), and what a period then adds to d for each action, (N, A).
 
         At 1, the reading is as low as it can be, growth is fastest and a dose takes off least; at -1 the other way
         round; in between all of it is so much less.

@@ -43,7 +43,7 @@ def area(regions: Regions) -> Array:
 
 
 def _clip(rows: Array, value: Array) -> Array:
-    """The part of a convex polygon where a linear function is >= 0.
+    """Cut a convex polygon to the part where a linear function is >= 0.
 
     Args: rows: corners in order with whatever is linear on the polygon beside them, (V, C). value: at them, (V,).
     """
@@ -56,7 +56,7 @@ def _clip(rows: Array, value: Array) -> Array:
 
 
 def _cells(rows: Array, layers: list[tuple[Array, Array]]) -> Iterator[Array]:
-    """The cells of a polygon on which all units keep their sign, with the last layer's inputs at their corners.
+    """Split a polygon into cells on which all units keep their sign, with the last layer's inputs at their corners.
 
     Args: rows: corners and, behind them, what enters the first of `layers` there, (V, 2 + n).
     """
@@ -95,7 +95,7 @@ def _best(corners: Array, q: Array, slack: Array) -> Iterator[tuple[Array, int]]
 
 
 def partition(network: Network, box: tuple[tuple[float, float], tuple[float, float]]) -> tuple[Regions, Regions]:
-    """A rectangle of the plane cut by a policy, twice.
+    """Partition a rectangle of the plane by a policy, twice.
 
     Returns: the exact polygons of the argmax, which tile the rectangle; and wider ones that hold every point at which
     single precision may choose the action.

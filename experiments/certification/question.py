@@ -57,7 +57,7 @@ class Question:
 
 
 def actions(policy: Policy) -> Array:
-    """The action grid, rising from 0. Raises: CertificationError for another one."""
+    """Return the action grid, rising from 0. Raises: CertificationError for another one."""
     grid = np.asarray(policy.actions, dtype=np.float64)
     if grid[0] != 0.0 or not (np.diff(grid) > 0.0).all():
         raise CertificationError("its actions do not rise from 0; train with the action grid of env")
@@ -65,7 +65,7 @@ def actions(policy: Policy) -> Array:
 
 
 def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
-    """The nominal model: the one that is asked for, else the one the policy was trained on.
+    """Choose the nominal model: the one that is asked for, else the one the policy was trained on.
 
     A policy of (error, growth share) serves any; that of the bench turns OD into e where bounds depend on the OD.
     Raises: CertificationError where the policy does not say it, or has another control period.
@@ -173,7 +173,7 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
 
 
 def question(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None = None) -> Question:
-    """What is to be proven of this kind of policy. Raises: CertificationError where it cannot be asked.
+    """Build what is to be proven of this kind of policy. Raises: CertificationError where it cannot be asked.
 
     Args: setpoints: at which errors that depend on the OD are asked about; None: the lowest, the middle, the highest.
     """

@@ -67,7 +67,7 @@ class ShareLoop:
         return np.stack([least, self.high[:, None] - self.doses * (1.0 - case.spread)], axis=2)
 
     def range(self, case: ShareCase) -> Array:
-        """The start as e, at the case's setpoint or at any, (S, 2)."""
+        """Return the start as e, at the case's setpoint or at any, (S, 2)."""
         lowest, highest = self.setpoints if case.setpoint is None else (case.setpoint, case.setpoint)
         ratio = np.array([self.start[0] / highest, self.start[1] / lowest])
         return np.broadcast_to(np.log(ratio) / (case.bounds.full_pump * (1.0 - case.scale)), (self.low.size, 2))
@@ -79,7 +79,7 @@ class ShareLoop:
         return low, high
 
     def _around(self, case: ShareCase, seen: Array) -> tuple[Array, Array]:
-        """The lowest and the highest e behind an estimate of it; both rise with the estimate."""
+        """Bound e behind an estimate of it from below and above; both bounds rise with the estimate."""
         off = case.bounds.error_at(seen, case.setpoint)
         low, high = seen - off, seen + off
         least, most = 1.0 - case.scale, 1.0 + case.scale
@@ -96,7 +96,7 @@ class ShareLoop:
         return around
 
     def law(self, case: ShareCase) -> Pieces:
-        """The one-line law: the dose nearest to clip(e + s, 0, 1)."""
+        """Apply the one-line law: the dose nearest to clip(e + s, 0, 1)."""
         middle = (self.doses[1:] + self.doses[:-1]) / 2.0
         off = case.bounds.growth_share
         low, _ = self._around(case, middle - self.high[:, None] - off)
@@ -120,13 +120,13 @@ class ShareLoop:
         return case.slow, case.bounds.gain, case.bounds.growth_share, errors.round(12).tobytes()
 
     def in_od(self, case: ShareCase, half_width: float) -> float | None:
-        """A half-width at the case's setpoint, OD; None for a case of none. B is at most (1 + gain) the case's."""
+        """Convert a half-width to OD at the case's setpoint; None without one. B is at most (1 + gain) the case's."""
         if case.setpoint is None:
             return None
         return float(case.setpoint * np.expm1(case.bounds.full_pump * (1.0 + case.scale) * half_width))
 
     def attack(self, case: ShareCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """What a state allows the policy to be shown, (N, 2), and what a period adds to e for each action then, (N, A).
+        """Attack: what a state allows to be shown, (N, 2), and what a period then adds to e for each action, (N, A).
 
         At 1, e and s are shown as low as they can be, doses give least and s is the strip's highest, of which the
         policy may still be shown the lowest; at -1 the other way round; in between all of it is so much less.

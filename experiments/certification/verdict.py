@@ -85,7 +85,7 @@ def physical(start: Array, shift: Array, goal: Array) -> Array:
 
 
 def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 0.0) -> Proof:
-    """What follows for every strip from where the policy may choose which action.
+    """Prove for every strip what follows from where the policy may choose which action.
 
     Args: points: of polygons in the strips that the policy is shown (`loop.seen`); action: of each polygon.
       margin: that a half-width may exceed the law's by.
@@ -122,7 +122,7 @@ def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Se
 
 
 def attacked(policy: Policy, loop: Loop, proof: Proof, trajectories: int) -> tuple[int, Array]:
-    """What trajectories of the policy itself, in single precision, make of the proven band.
+    """Attack the proven band by trajectories of the policy itself, in single precision.
 
     They start anywhere in the band of any strip that has one. Everything that may be off is off as far as it can be to
     one side, which turns at random: often, which finds the steps of the policy, or seldom, which goes a long way. Now

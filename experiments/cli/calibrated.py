@@ -24,12 +24,12 @@ T = TypeVar("T")
 
 
 def read_env_file(path: str) -> EnvConfig:
-    """The model of a calibrated.yaml. Raises: UserError naming the file and what is wrong with it."""
+    """Read the model of a calibrated.yaml. Raises: UserError naming the file and what is wrong with it."""
     return _read("env_file", path, "calibrated.yaml", EnvConfig(), "env")
 
 
 def read_curves(run: str, env: CocultureConfig) -> CocultureConfig:
-    """A task of two species on the growth curves that a run has found, and with its pair.
+    """Build a task of two species on the growth curves that a run has found, and with its pair.
 
     Args: run: folder of a deployment with one reactor that holds a share, or RUN/recordings/NAME.csv of one of several.
     Raises: UserError naming what is missing.
@@ -64,12 +64,12 @@ def read_curves(run: str, env: CocultureConfig) -> CocultureConfig:
 
 
 def read_plant_file(path: str) -> PlantConfig:
-    """The plant of a twin.yaml. Raises: UserError naming the file and what is wrong with it."""
+    """Read the plant of a twin.yaml. Raises: UserError naming the file and what is wrong with it."""
     return _read("plant_file", path, "twin.yaml", PlantConfig(), "plant")
 
 
 def read_pair(name: str) -> PairConfig:
-    """A pair of species: a preset of conf/strains, or the pair.yaml of a calibration.
+    """Read a pair of species: a preset of conf/strains, or the pair.yaml of a calibration.
 
     Raises: UserError naming the presets, or the file and what is wrong with it.
     """

@@ -9,13 +9,13 @@ BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
 
 
 def given(folder: Path) -> list[str]:
-    """The words of the command line of a run folder, `key=value` each; [] where it does not say."""
+    """List the words of the command line of a run folder, `key=value` each; [] where it does not say."""
     path = folder / ".hydra" / "overrides.yaml"
     return re.findall(r"^- \+*(.+)$", path.read_text(encoding="utf-8"), re.MULTILINE) if path.is_file() else []
 
 
 def choices(folder: Path) -> dict[str, str]:
-    """group -> preset of a run folder, {} where it does not say; a group without a preset is left out."""
+    """Map group to preset of a run folder, {} where it does not say; a group without a preset is left out."""
     path = folder / ".hydra" / "hydra.yaml"
     block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
     pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))

@@ -41,7 +41,7 @@ complete -c turbidostat -a '(turbidostat complete (commandline -cp | string coll
 
 
 def candidates(line: str, commands: list[str]) -> list[str]:
-    """The words that may stand in place of the last one of a command line.
+    """List the words that may stand in place of the last one of a command line.
 
     Args: line: up to the cursor, the program's name first. commands: names of all commands.
     """
@@ -74,7 +74,7 @@ def _of_command(name: str, before: list[str], last: str) -> Iterator[str]:
 
 
 def _config(command: Command[Any], words: list[str]) -> Any:
-    """What the rest of the line gives; by itself where that does not fit yet."""
+    """Compose the config of the rest of the line; the default where the line is not valid yet."""
     try:
         return command.config([w for w in words if not w.startswith("-")])
     except (UserError, ValueError):

@@ -79,7 +79,7 @@ def _line_in(path: Path, error: Exception) -> str:
 
 
 def preset_file(group: str, option: str) -> str:
-    """The name under which `group=FILE.yaml` is a preset from now on; any other option as it is.
+    """Register `group=FILE.yaml` as a preset and return its name; return any other option as it is.
 
     Raises: ValueError naming the file and what is wrong with it.
     """

@@ -17,7 +17,7 @@ __all__ = ["load_yaml", "plain", "write_csv", "write_json"]
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:
-    """A YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
+    """Load a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
 
     Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
     """
@@ -31,7 +31,7 @@ def load_yaml(path: Path | str) -> DictConfig | ListConfig:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: arrays and tuples are lists, keys are text, numbers that are not finite are null."""
+    """Convert a value to JSON's types: arrays and tuples to lists, keys to text, non-finite numbers to null."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -80,7 +80,7 @@ SEVERAL = re.compile(r"(?:Sweep parameters|Ambiguous value for argument) '\+*(.+
 
 
 def _one_line(error: Exception) -> str:
-    """A message on one line."""
+    """Put a message on one line."""
     lines = [line.strip() for line in str(error).splitlines()]
     if several := SEVERAL.match(lines[0] if lines else ""):
         word = several[1]
@@ -90,7 +90,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _refusal(error: BaseException | None) -> str | None:
-    """The line about a disk that refused, None for any other error.
+    """Word the refusal of a disk, None for any other error.
 
     Whoever wrote may have wrapped the system's error in one of its own, as torch and logging do.
     """
@@ -102,7 +102,7 @@ def _refusal(error: BaseException | None) -> str | None:
 
 
 def _in_thread(failed: threading.ExceptHookArgs) -> None:
-    """An event writer's thread hands a refusal on to the run, which tells it; everything else is shown."""
+    """Hand a refusal in an event writer's thread on to the run, which reports it; show everything else."""
     if _refusal(failed.exc_value) is None:
         threading.__excepthook__(failed)
 
@@ -113,7 +113,7 @@ def _silence(stream: TextIO) -> None:
 
 
 def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
-    """A composed config as the checked dataclass.
+    """Convert a composed config to the checked dataclass.
 
     Args:
       schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
@@ -153,7 +153,7 @@ def save_config(config: Any, folder: Path) -> None:
 
 
 def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
-    """The config a run was started with. Raises: UserError naming the file and what is wrong with it."""
+    """Read the config a run was started with. Raises: UserError naming the file and what is wrong with it."""
     try:
         stored = files.load_yaml(path)
         if not isinstance(stored, DictConfig):
@@ -187,11 +187,11 @@ class Command(Generic[T]):
     goes_on: bool = False
 
     def fitting(self, cfg: DictConfig) -> T:
-        """The schema of a composed config."""
+        """Return the schema of a composed config."""
         return self.schema if self.choose is None else self.choose(cfg)
 
     def config(self, overrides: Sequence[str] = ()) -> T:
-        """The checked config of a command line. Raises: UserError."""
+        """Return the checked config of a command line. Raises: UserError."""
         cfg = compose(self.name, overrides)
         return load(cfg, self.fitting(cfg))
 
@@ -257,7 +257,7 @@ class Command(Generic[T]):
         self._hydra()
 
     def _hydra(self) -> None:
-        """What the command line says, by Hydra."""
+        """Run Hydra on the command line."""
         sys.argv.append(f"hydra.job.name={self.name}")
         if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
             sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
@@ -287,7 +287,7 @@ class Command(Generic[T]):
             sys.exit(1)
 
     def _refuse(self, jobs: list[list[str]]) -> None:
-        """A word that no job can take leaves no folder. Raises: UserError of the first job where all are refused."""
+        """Refuse words that no job can take, before a folder is made. Raises: UserError of the first job."""
         refusals = []
         for job in jobs:
             try:
@@ -342,7 +342,7 @@ class Command(Generic[T]):
             return None
 
     def _once(self, cfg: DictConfig, folder: Path, job: sweep.Job) -> float | None:
-        """What is missing of a job."""
+        """Run what is missing of a job."""
         try:
             config = load(cfg, self.fitting(cfg))
             job.begin(config)
@@ -372,7 +372,7 @@ class Command(Generic[T]):
             return None
 
     def _left(self, folder: Path) -> str:
-        """What a run that did not come to its end leaves, and how to go on."""
+        """Say what a run that did not come to its end leaves, and how to go on."""
         own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$|reactors$|agents$")
         names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"

@@ -18,7 +18,7 @@ LEFT = 44  # columns of `key = value`
 
 
 def shown(value: Any) -> str:
-    """A value as it is written on a command line."""
+    """Write a value as on a command line."""
     if isinstance(value, list | tuple):
         return "[" + ",".join(shown(v) for v in value) + "]"
     if isinstance(value, dict):
@@ -39,7 +39,7 @@ def _line(left: str, right: str, at: int) -> list[str]:
 
 
 def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
-    """The plain values of a config, then its parts, each below a line of its own; without `deep` a line for each."""
+    """List the plain values of a config, then its parts, each below its own line; without `deep` a line for each."""
     parts: list[tuple[str, str, Any]] = []
     default = type(config)()
     for entry in entries(config):
@@ -71,7 +71,7 @@ def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
 
 
 def _group(name: str, group: str, start: str | None) -> list[str]:
-    """A config group: each of its presets with a sentence."""
+    """Describe a config group: each of its presets with a sentence."""
     lines = [f"  {group}=" + (f"    (by itself {start})" if start else "")]
     return lines + [
         x for option in options(name, group) for x in _line(f"    {option}", sentence(f"{group}/{option}"), 26)
@@ -107,12 +107,12 @@ def _leaves(config: Any) -> Iterator[str]:
 
 
 def _parts(name: str, config: Any) -> dict[str, Any]:
-    """Groups of a command and parts of its config; None where a group has no part of its name."""
+    """Map the groups of a command to parts of its config; None where a group has no part of its name."""
     return dict.fromkeys(chosen(name)) | {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
 
 
 def text(name: str, config: Any, about: str = "") -> str:
-    """What `--help` prints, with the values that the rest of the command line gives.
+    """Write the text of `--help`, with the values that the rest of the command line gives.
 
     Args: name: of the command; config: what it would run with; about: "all", a group or a part of the config with its
       own values; "": what one looks for first.

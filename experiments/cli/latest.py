@@ -17,7 +17,7 @@ FOLDERS = ("resume", "runs", "run")  # keys that are given the folder of the fil
 
 
 def newest(patterns: Sequence[str]) -> Path | None:
-    """The file written last of those that match below `ROOT`, None if there is none."""
+    """Find the newest file that matches below `ROOT`, None if there is none."""
     found = [path for pattern in patterns for path in ROOT.glob(pattern)]
     return max(found, key=lambda path: path.stat().st_mtime, default=None)
 

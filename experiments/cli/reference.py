@@ -36,7 +36,7 @@ part is written with the part's name before it: `bench.max_rate=0.01`.
 
 
 def page() -> str:
-    """The whole page."""
+    """Write the whole page."""
     known: dict[str, Command[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
     parts: dict[type[Any], str] = {}
     for command in known.values():
@@ -59,7 +59,7 @@ def page() -> str:
 
 
 def _said(name: str) -> str:
-    """What a preset is; a recipe with the command that it is for."""
+    """Describe a preset; a recipe with the command that it is for."""
     of = owner(name)
     return f"{of}: {sentence(name)}" if of else sentence(name)
 
@@ -70,7 +70,7 @@ def _anchor(heading: str) -> str:
 
 
 def _variants(command: Command[Any]) -> Iterator[Any]:
-    """The command's config with every kind of backend and controller that it may hold."""
+    """Yield the command's config with every kind of backend and controller that it may hold."""
     yield command.config()
     if command.choose:
         for group in ("backend", "controller", "composition"):
@@ -93,7 +93,7 @@ def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
 
 
 def _part(config: Any, entry: Entry) -> type[Any] | None:
-    """What kind of part a field holds, itself or by name."""
+    """Return the kind of part that a field holds, itself or by name."""
     of: Any = type(entry.value)
     if of is dict:
         of = get_args(get_type_hints(type(config))[entry.name])[1]
@@ -101,7 +101,7 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
 
 
 def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
-    """A row per field; a part has a table of its own."""
+    """Write a row per field; a part has a table of its own."""
     rows = []
     for entry in entries(config):
         of = _part(config, entry)
@@ -113,7 +113,7 @@ def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
 
 
 def _changes(name: str) -> str:
-    """The values of a preset's own file, and the preset it starts from."""
+    """List the values of a preset's own file, and the preset it starts from."""
     own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
     changed = ", ".join(f"`{key}={shown(value)}`" for key, value in flat(own))

@@ -42,7 +42,7 @@ def register() -> None:
 
 
 def _distribution(name: str, said: Mapping[str, Any]) -> Any:
-    """An entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError naming it."""
+    """Read an entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError naming it."""
     of: Any = import_module("optuna.distributions")
     try:
         if "choices" in said:
@@ -77,7 +77,7 @@ class Search(Sweeper):
         )
 
     def _open(self) -> Any:
-        """The study in the folder, begun by whoever comes first."""
+        """Open the study in the folder, or begin it."""
         optuna: Any = import_module("optuna")
         optuna.logging.set_verbosity(logging.WARNING)
         (self.folder / ".trials").mkdir(parents=True, exist_ok=True)

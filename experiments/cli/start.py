@@ -13,7 +13,7 @@ HOME = Path(__file__).parents[2]  # where all packages of ours stand side by sid
 
 
 def begin() -> None:
-    """Raises: SystemExit with one line for a command that would import other packages, ImportError for a library."""
+    """Refuse packages of other projects. Raises: SystemExit with one line for a command, ImportError for a library."""
     first = Path(sys.argv[0] if sys.argv else "").name
     command = first in ("-m", "turbidostat")  # the interpreter still looks for the command, or the script imports it
     if line := _other_package():
@@ -23,7 +23,7 @@ def begin() -> None:
 
 
 def _other_package() -> str | None:
-    """A folder `envs/` where a command is started, or another installed package of that name, comes before ours."""
+    """Find a folder `envs/` of the user's, or another installed package of that name, that comes before ours."""
     for name in PACKAGES:
         spec = find_spec(name)
         places = list(spec.submodule_search_locations or [str(spec.origin)]) if spec is not None else []
@@ -36,12 +36,12 @@ def _other_package() -> str | None:
 
 
 def version() -> str:
-    """What `--version` says."""
+    """Write the text of `--version`."""
     return f"turbidostat-dqn {metadata.version('turbidostat-dqn')}"
 
 
 def stopped() -> str:
-    """What a stop says before anything began; a run that was to be resumed may have left a pump on."""
+    """Word a stop before anything began; a run that was to be resumed may have left a pump on."""
     words = sys.orig_argv
     deploys = any(Path(word).name in ("deploy", "deploy.py", "experiments.deploy") for word in words)
     resumed = deploys and any(word.lstrip("+").startswith("resume=") for word in words)

@@ -32,7 +32,7 @@ AGAIN_S = 0.1  # after which a stop that was lost is raised once more
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
-    """These signals call `handler` for a while, except those that are ignored on purpose (nohup)."""
+    """Let these signals call `handler` for a while, except those that are ignored on purpose (nohup)."""
     before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
     for number in before:
         signal.signal(number, handler)
@@ -59,7 +59,7 @@ class _Stop(KeyboardInterrupt):
 
 
 def heard() -> None:
-    """A stop has arrived, and what follows must not be stopped again: whoever handles one and goes on says so."""
+    """Note that a stop was handled: whoever handles one and goes on calls this, so that nothing stops it again."""
     _Wait.heard = True
 
 
@@ -89,7 +89,7 @@ def _interrupt(number: int, stack: FrameType | None) -> None:
 
 @contextmanager
 def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """The signals of a stop go to `handler`; one that leaves this has arrived."""
+    """Send the signals of a stop to `handler`; one that leaves this context has arrived."""
     before, _Wait.heard = signal.getsignal(signal.SIGALRM), False
     try:
         with handled(handler, *SIGNALS):
@@ -138,7 +138,7 @@ def one_interrupt() -> Iterator[None]:
 
 @contextmanager
 def unmasked() -> Iterator[None]:
-    """A stop is a KeyboardInterrupt, also where an extension module that was being loaded made an ImportError of it."""
+    """Turn an ImportError that a stop caused while an extension module was loaded back into a KeyboardInterrupt."""
     try:
         yield
     except (ImportError, SystemError) as error:

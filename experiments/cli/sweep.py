@@ -40,7 +40,7 @@ class Sweep:
     arguments: list[str]
 
     def line(self) -> list[str]:
-        """The command line, in which the folder stands as it is: workers and later starts all find it there."""
+        """Return the command line with the folder spelled out, so that workers and later starts find it."""
         return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse takes the flag only in front
 
     def save(self) -> None:
@@ -53,7 +53,7 @@ class Sweep:
         files.write_json(self.folder / RECORD, {"command": self.command, "arguments": self.arguments})
 
     def again(self) -> str:
-        """The command that does what is missing."""
+        """Return the command that does what is missing."""
         return f"python -m experiments.{self.command} -m resume={shlex.quote(str(self.folder))}"
 
 
@@ -68,7 +68,7 @@ def fresh(command: str) -> Path:
 
 
 def read(folder: Path) -> Sweep | None:
-    """The sweep in a folder, None where there is none or its record is damaged."""
+    """Read the sweep in a folder, None where there is none or its record is damaged."""
     try:
         found = json.loads((folder / RECORD).read_text("utf-8"))
         return Sweep(folder, str(found["command"]), [str(a) for a in found["arguments"]])
@@ -77,7 +77,7 @@ def read(folder: Path) -> Sweep | None:
 
 
 def asked(given: Sequence[str], command: str) -> Sweep | None:
-    """The sweep that a command line asks for, None where it asks for a single run.
+    """Return the sweep that a command line asks for, None where it asks for a single run.
 
     `resume=SWEEP` is the sweep that was begun there, by whatever launcher it names now.
     Raises: UserError where it names anything else beside.
@@ -111,7 +111,7 @@ def searches(arguments: Sequence[str]) -> bool:
 
 
 def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
-    """The overrides of every job, in order; None for a search, whose jobs follow from each other.
+    """List the overrides of every job, in order; None for a search, whose jobs follow from each other.
 
     Args: arguments: in the form that Hydra takes. Raises: hydra.errors.HydraException for what is none.
     """
@@ -144,7 +144,7 @@ class Job:
 
     @classmethod
     def at(cls, folder: Path) -> "Job":
-        """The job of a folder, whatever there is of it."""
+        """Return the job of a folder, whatever there is of it."""
         try:
             found = json.loads((folder / JOB).read_text("utf-8"))
             return cls(folder, found["state"], found["config"], found["objective"], found["error"])
@@ -158,7 +158,7 @@ class Job:
         files.write_json(self.folder / JOB, kept)
 
     def begin(self, config: Any) -> None:
-        """The job is to do this. Raises: UserError where its folder holds a run of another config."""
+        """Begin the job with this config. Raises: UserError where its folder holds a run of another config."""
         digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
         if self.config not in ("", digest):
             raise UserError(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
@@ -167,7 +167,7 @@ class Job:
             self.save("running")
 
     def put_aside(self) -> None:
-        """What an earlier life of the job left and nobody can go on with goes to stopped_1, stopped_2, ..."""
+        """Move files of an earlier start that nobody can continue to stopped_1, stopped_2, ..."""
         own = (JOB, ".hydra", ".lock")
         left = [p for p in self.folder.iterdir() if p.name not in own and p.suffix != ".log"]
         left = [p for p in left if not p.name.startswith("stopped_")]
@@ -205,7 +205,7 @@ def _free(folder: Path) -> bool:
 
 
 def _state(job: Job) -> str:
-    """A job as it stands now: a process that was killed leaves `running` behind."""
+    """Return the state of a job now: a process that was killed leaves `running` behind."""
     if job.state == "missing" and (job.folder / "summary.json").is_file():  # of a sweep without records
         return "finished"
     return "stopped" if job.state == "running" and _free(job.folder) else job.state
@@ -227,7 +227,7 @@ def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
 
 
 def _given(folder: Path) -> list[str]:
-    """The overrides of a job that has begun, as Hydra wrote them down."""
+    """Read the overrides of a job that has begun, as Hydra wrote them down."""
     try:
         lines = files.load_yaml(folder / ".hydra" / "overrides.yaml")
         return [str(line) for line in lines]

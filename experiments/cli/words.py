@@ -98,7 +98,7 @@ def _with_preset_files(arg: str) -> str:
 
 
 def _engine(group: str, option: str) -> str:
-    """A launcher of Hydra's that is there. Raises: UserError with the remedy for one that is not installed."""
+    """Check that a launcher of Hydra's is installed. Raises: UserError with the remedy for one that is not."""
     needs = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit", "slurm": "submitit"}
     if group == "hydra/launcher":
         if option not in ("basic", *needs):
@@ -109,6 +109,6 @@ def _engine(group: str, option: str) -> str:
 
 
 def resumed(argv: Sequence[str]) -> str | None:
-    """The run folder to go on in."""
+    """Return the run folder to continue in."""
     given = [arg.removeprefix("resume=") for arg in argv if arg.startswith("resume=") and arg != "resume=null"]
     return given[-1] if given else None

@@ -55,7 +55,7 @@ def _handles(controllers: Sequence[str]) -> list[Line2D]:
 def _estimate(
     ax: Axes, mark: tuple[str, str], y: float, value: float, interval: Sequence[float], hollow: bool = False
 ) -> None:
-    """A law's mark with its 95 % interval, where it has one."""
+    """Draw a law's mark with its 95 % interval, where it has one."""
     colour, marker = mark
     if np.isfinite(interval[0]):
         ax.plot(interval, [y, y], color=colour, linewidth=1.3)
@@ -121,7 +121,7 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
 
 
 def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """The cells of the paper's Table 2 (hollow) beside ours (filled, bar = 95 % interval of the mean)."""
+    """Draw the cells of the paper's Table 2 (hollow) beside ours (filled, bar = 95 % interval of the mean)."""
     cells = list(dict.fromkeys((p.scenario, p.window) for p in TABLE_2))
     names = [f"{w} °C" if s == "temperature_switch" else f"OD {w}" for s, w in cells]
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
@@ -238,7 +238,7 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
 
 
 def shares(trials: Sequence[ShareTrial]) -> Figure:
-    """A column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
+    """Draw a column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
     columns = len(trials)
     figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
     for k, trial in enumerate(trials):

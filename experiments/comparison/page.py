@@ -63,12 +63,12 @@ SHARE = {
 
 
 def law_of(entry: Row) -> str:
-    """The law of an entry as a reader knows it."""
+    """Name the law of an entry as a reader knows it."""
     return f"{entry['controller']}, told ahead" if entry.get("preview") else str(entry["controller"])
 
 
 def name_of(scenario: str, window: str) -> str:
-    """A window as a reader knows it."""
+    """Name a window as a reader knows it."""
     return f"{window} °C" if scenario == "temperature_switch" else window if "h" in window else f"OD {window}"
 
 
@@ -89,15 +89,17 @@ def _mark(text: str, best: bool) -> str:
 
 
 def beside(summary: Row) -> list[Row]:
-    """The rows that stand beside the paper's table."""
+    """List the rows that stand beside the paper's table."""
     keys = ("controller", "plant", "scenario", "window")
     chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
     return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
 
 
 def table_2(rows: Sequence[Row], metric: str) -> Table:
-    """The paper's table for one metric beside this run's; the lowest of the paper's three controllers is marked and
-    named on each side. Controllers that the paper does not have follow in columns of their own, without a rank.
+    """Build the paper's table for one metric beside this run's.
+
+    The lowest of the paper's three controllers is marked and named on each side. Controllers that
+    the paper does not have follow in columns of their own, without a rank.
     """
     body: list[tuple[str, ...]] = []
     others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
@@ -128,7 +130,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
 
 
 def cell_by_cell(rows: Sequence[Row]) -> Table:
-    """Published beside ours for each controller, in both conventions, and which is lower."""
+    """Compare published and ours for each controller, in both conventions, and say which is lower."""
     body = []
     for p in TABLE_2:
         row = _find(rows, controller=p.controller, scenario=p.scenario, window=p.window)
@@ -187,7 +189,7 @@ def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> 
 
 
 def published_losses() -> list[str]:
-    """The cells of the published table that its DQN loses."""
+    """List the cells of the published table that its DQN loses."""
     found = []
     for metric in METRICS:
         for scenario, window in dict.fromkeys((p.scenario, p.window) for p in TABLE_2):
@@ -340,7 +342,7 @@ def _interval(ci: Sequence[float | None]) -> str:
 
 
 def _in_short(out: Page, summary: Row) -> None:
-    """What came out: the learned policy beside the paper's, and the lowest of every scenario and plant."""
+    """Summarise: the learned policy beside the paper's, and the lowest of every scenario and plant."""
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
     for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] == "share")):
         key, _ = RANKED[str(entry["signal"])]
@@ -366,7 +368,7 @@ def _runs(entry: Row) -> bool:
 
 
 def _alone(summary: Row, entry: Row) -> str:
-    """A law that met no other one: what it scored, beside the oracle where that was run, and the sensor's noise."""
+    """Describe a law that met no other one: its score, beside the oracle where that was run, and the sensor's noise."""
     oracle = _find(summary["totals"], controller="oracle", plant=entry["plant"], scenario=entry["scenario"])
     scores = []
     for metric in METRICS:
@@ -377,7 +379,7 @@ def _alone(summary: Row, entry: Row) -> str:
 
 
 def _first(laws: Mapping[str, Sequence[float]]) -> str:
-    """The lowest of laws and the next one, by the mean of their values."""
+    """Name the lowest of laws and the next one, by the mean of their values."""
     means = {law: sum(values) / len(values) for law, values in laws.items()}
     (law, value), (other, beyond), *_ = sorted(means.items(), key=lambda item: item[1])
     return f"{law} {number(value)}, then {other} {number(beyond)}"
@@ -413,7 +415,7 @@ def _paper_section(out: Page, summary: Row) -> None:
 
 
 def _below_bound(summary: Row) -> str:
-    """Published ISE that no controller can reach on the training model, where the oracle was run on it."""
+    """Name published ISE that no controller can reach on the training model, where the oracle was run on it."""
     found = []
     for p in TABLE_2:
         if p.scenario != "setpoint_steps":
@@ -432,7 +434,7 @@ def _below_bound(summary: Row) -> str:
 
 
 def _settings(agents: Mapping[str, Row]) -> Table | None:
-    """The hyper-parameters in which the agents trained here differ."""
+    """Tabulate the hyper-parameters in which the agents trained here differ."""
     trained = {name: entry["agent"] for name, entry in agents.items() if "agent" in entry}
     if len(trained) < 2:
         return None
@@ -468,7 +470,7 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
 
 
 def _density(out: Page, summary: Row, run: Path) -> None:
-    """The paper's table, the figures, every plant."""
+    """Add the paper's table, the figures, every plant."""
     if summary["beside_paper"]:
         _paper_section(out, summary)
     regulated = _find(summary["rows"], controller="dqn", scenario="regulation")
@@ -517,7 +519,7 @@ def _od(row: Row) -> str:
 
 
 def _share(out: Page, summary: Row, run: Path) -> None:
-    """A section of every scenario."""
+    """Add a section of every scenario."""
     errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
     for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
         out.section(scenario)
@@ -559,7 +561,7 @@ SECTIONS = {
 
 
 def of_benchmark(run: Path) -> Page:
-    """The page of a benchmark's run folder."""
+    """Build the page of a benchmark's run folder."""
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]
     out = Page(

@@ -121,7 +121,7 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
-    """What each law of a share follows, if anything; the run folder keeps copies. Raises: UserError naming the file."""
+    """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
     found: dict[str, Followed | None] = {}
     for name in names:
         kept = folder / "policies" / name

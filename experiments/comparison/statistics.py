@@ -94,7 +94,7 @@ def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
 
 
 def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """The rows of every trial: of a density one per window, of a share one."""
+    """List the rows of every trial: of a density one per window, of a share one."""
     return [found for trial in trials for found in ROWS[trial.cell.signal](trial)]
 
 
@@ -124,7 +124,7 @@ def _last_day(trial: ShareTrial) -> Array:
 
 
 def share_row(trial: ShareTrial) -> dict[str, Any]:
-    """The row of a share in summary.json, judged by what the share truly was."""
+    """Build the row of a share in summary.json, judged by the true share."""
     error = Spread(abs_error(trial))
     inside = (trial.low <= trial.share) & (trial.share <= trial.high)
     return _names(trial) | {
@@ -150,7 +150,7 @@ ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
 
 
 def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
-    """What `rows` leaves out, one entry per row: the other convention, the noise-free OD, the floor, the effort."""
+    """List what `rows` leaves out, an entry per row: the other convention, the noise-free OD, the floor, the effort."""
     found = []
     for trial in trials:
         for window in windows(trial.schedule):
@@ -248,8 +248,9 @@ SCORES: dict[str, Callable[[Any], Scored]] = {
 
 
 def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
-    """Every law minus `against` on the same vials, window by window: mean difference over replicates and its 95 %
-    interval, and in how many replicates it is lower.
+    """Compare every law with `against` on the same vials, window by window.
+
+    Returns: mean difference over replicates with its 95 % interval, and in how many replicates it is lower.
     """
     found = []
     for one, other in _partners(trials, against):

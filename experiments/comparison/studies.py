@@ -38,7 +38,7 @@ class Drawing(NamedTuple):
 
 
 def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
-    """The open-loop protocol on the training model with 1 % noise, and the fit to it.
+    """Run the open-loop protocol on the training model with 1 % noise, and fit it.
 
     Raises: ValueError where the recording cannot be fitted.
     """
@@ -64,7 +64,7 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
 
 
 def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
-    """The figures of the studies, from the trials and from the numbers of `summarise`."""
+    """Draw the figures of the studies, from the trials and from the numbers of `summarise`."""
     yield from _shares([t for t in trials if isinstance(t, ShareTrial)], summary["rows"])
     yield from _closed_loops(config, [t for t in trials if isinstance(t, DensityTrial)])
     if {"setpoint_steps", "temperature_switch"} & set(config.studies):
@@ -144,7 +144,7 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
 
 
 def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[dict[str, Any]]:
-    """The rows that stand beside the paper's table: first plant of the studies named like its scenarios."""
+    """List the rows beside the paper's table: first plant of the studies named like its scenarios."""
     shown = []
     for name in ("setpoint_steps", "temperature_switch"):
         if name in config.studies and config.studies[name].plants:

@@ -95,7 +95,7 @@ class Window:
 
 
 def windows(schedule: Scenario) -> list[Window]:
-    """The phases of a schedule with their names."""
+    """List the phases of a schedule with their names."""
     edges = schedule.edges
     by_setpoint = [f"{s:g}" for s in schedule.setpoints]
     by_temperature = [f"{t:g}" for t in schedule.temperatures]
@@ -239,7 +239,7 @@ Followed = tuple[Policy, EstimateBounds | None]
 
 
 def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
-    """A controller holds the density behind an interlock."""
+    """Run a trial in which a controller holds the density behind an interlock."""
     policy, bounds = followed or (None, None)
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
@@ -248,7 +248,7 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
 
 
 def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
-    """A law holds the share, and a controller the density beside it."""
+    """Run a trial in which a law holds the share, and a controller the density beside it."""
     pair, kind = read_pair(config.pair), config.compositions[cell.controller].kind
     scenario = config.scenarios[cell.scenario]
     program = program_of(scenario)
@@ -322,7 +322,7 @@ def run_share(
 
 
 def _beside(config: BenchmarkConfig, name: str) -> Controller:
-    """What holds the density beside a share. Raises: UserError for a policy that does not fit."""
+    """Build the controller of the density beside a share. Raises: UserError for a policy that does not fit."""
     kind, policy = config.controllers[name].kind, None
     if kind == "dqn":
         policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)

@@ -99,7 +99,7 @@ class Setup:
 
 
 def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
-    """A run goes by its own copy of the two species from a file, `pair.yaml`, also when it is resumed."""
+    """Keep a copy of two species from a file, `pair.yaml`, by which the run goes, also when it is resumed."""
     kept, given = folder / FILE, read_pair(config.pair) if config.resume is None else None
     if given is not None and config.pair not in presets.groups()["strains"]:
         text = yaml.safe_dump(files.plain(asdict(given)), sort_keys=False, allow_unicode=True)
@@ -280,7 +280,7 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
-    """The signals that are held beside the density. Raises: UserError where scenario, backend and they do not fit."""
+    """Build the signals held beside the density. Raises: UserError where scenario, backend and they do not fit."""
     with frame.refusing(ValueError):
         share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
         own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
@@ -291,7 +291,7 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
 
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
-    """The share of the second species. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
+    """Build the signal of the share. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
     asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if s.composed]
     kind = config.composition.kind
     if not asked:
@@ -361,7 +361,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
 
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
-    """The loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
+    """Open the loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
     opening = Opening(setup.backend, setup.bench, setup.plant, record.journal, record.folder, setup.resumed)
     with setup.family.open(opening) as reactors:
         try:

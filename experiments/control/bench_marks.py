@@ -20,8 +20,10 @@ class BenchMarks:
         self._taken = sum(row["kind"] in ("level", "share") for row in record.journal.rows)
 
     def take(self, loop: ClosedLoop) -> None:
-        """Tell the loop what was marked since the last call. Raises: RecordingError of the journal; a damaged file of
-        marks is only said."""
+        """Tell the loop what was marked since the last call; a damaged file of marks is only reported.
+
+        Raises: RecordingError of the journal.
+        """
         path = self._record.folder / NAME
         size = path.stat().st_size if path.is_file() else -1
         if size == self._size:

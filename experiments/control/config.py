@@ -121,21 +121,21 @@ class DeployConfig:
         return schedules
 
     def ends(self) -> list[str]:
-        """What each reactor does when its schedule is over. Raises: ValueError naming reactor and what is allowed."""
+        """List what each reactor does after its schedule. Raises: ValueError naming reactor and what is allowed."""
         ends = [str(self.each.get(name, {}).get("at_end", self.at_end)) for name in self.backend.reactors]
         for name, end in zip(self.backend.reactors, ends, strict=True):
             require(end in AT_END, f"each.{name}.at_end", end, ", ".join(AT_END))
         return ends
 
     def roles(self) -> list[str]:
-        """What each reactor is for, in words of the user."""
+        """List what each reactor is for, in words of the user."""
         return [str(self.each.get(name, {}).get("role", "replicate")) for name in self.backend.reactors]
 
 
 def deploy_schema(
     kind: str, controller: str = "dqn", composition: str | None = None, own: Mapping[str, str] | None = None
 ) -> DeployConfig:
-    """The schema for the backend and laws of these kinds. Args: own: signal of one's own -> its law.
+    """Build the schema for the backend and laws of these kinds. Args: own: signal of one's own -> its law.
 
     Raises: ValueError naming the kinds there are.
     """

@@ -32,7 +32,7 @@ ADDRESS = ("http://", "https://")
 
 
 def hidden(arguments: Sequence[str], environment: MutableMapping[str, str]) -> list[str]:
-    """A command line whose `notify=https://...` has become `notify=env:DEPLOY_HOOK`, with the address put there."""
+    """Move the address of `notify=https://...` into the environment: `notify=env:DEPLOY_HOOK`."""
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -168,7 +168,7 @@ class Notifier:
 
 
 def opened(target: str, run: Path, resumed: bool) -> Notifier:
-    """The notifier of a config's `notify`.
+    """Open the notifier of a config's `notify`.
 
     Raises: UserError for a variable that is not set, unless the run is resumed: a culture waits for that, so it goes
       on untold and says so.

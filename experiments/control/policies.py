@@ -108,7 +108,7 @@ class Training:
         return [reason for reason, holds in reasons.items() if holds]
 
     def unsaid(self) -> list[str]:
-        """What the file does not say."""
+        """List what the file does not say."""
         said = {"updates": self.updates, "regret": self.regret_pct}
         said |= {} if self.relative else {"trained setpoints": self.setpoints[0]}
         return [name for name, value in said.items() if np.isnan(value)]
@@ -124,7 +124,7 @@ class Training:
 
 
 def find_policy(name: str) -> Path:
-    """A policy.npz from a path, a run folder, `shipped`, or `latest`: what `train` or `demo` wrote last.
+    """Find a policy.npz by path, run folder, `shipped`, or `latest`: what `train` or `demo` wrote last.
 
     Raises: UserError saying what to give instead.
     """
@@ -143,7 +143,7 @@ def find_policy(name: str) -> Path:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Reading a policy. Raises: UserError naming the file and what is wrong with it."""
+    """Read a policy in this context. Raises: UserError naming the file and what is wrong with it."""
     try:
         yield
     except policies.PolicyError as error:
@@ -154,7 +154,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
-    """The policy that `find_policy` finds, checked against control period and interlock.
+    """Load the policy that `find_policy` finds, checked against control period and interlock.
 
     Args: control_min: of the backend, min. max_rate: largest pump rate that the interlock allows, mL/s.
     Raises: UserError naming the file and, for a mismatch, both values.
@@ -225,7 +225,7 @@ def policy_check(wanted: Wanted) -> Check:
 
 
 def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:
-    """The policy of a run, of which the run folder keeps a copy with its certificate; a resumed run goes on with it.
+    """Load the policy of a run; the run folder keeps a copy with its certificate, which a resumed run uses.
 
     The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.
     Raises: UserError as `load_policy`, and if the copy cannot be written.
@@ -256,7 +256,7 @@ def _share_policy(name: str) -> Path:
 
 
 def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:
-    """The policy of a composition controller, None for one that follows no policy; the run folder keeps a copy.
+    """Load the policy of a composition controller, None for one without; the run folder keeps a copy.
 
     Args: kind: of the controller. name: `shipped`, a policy.npz or a run folder.
     Raises: UserError naming the file and what is wrong with it.

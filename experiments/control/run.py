@@ -45,7 +45,7 @@ def _began(setup: Setup, folder: Path) -> None:
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
-    """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
+    """Run the loop until its end or trouble; return the outcome. Pumps are verified off, whatever happens."""
     log_changes, marks, reactors = ChangeLog(loop, tell), BenchMarks(record), loop.reactors
     outcome = "failed: see the log"
     record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
@@ -136,7 +136,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
-    """The loop with everything that it leaves behind; returns the outcome. Raises: ReactorError, UserError."""
+    """Run the loop with all its output files; return the outcome. Raises: ReactorError, UserError."""
     kept = setup.backend.reactors, setup.fsync, setup.columns
     with one_interrupt(), closing(Record(folder, *kept)) as record:
         for repair in record.repairs:

@@ -38,7 +38,7 @@ def _reaches(od: float, level: float, growth: float, dilution: float) -> float:
 
 
 def _fed_ml(minutes: float, reached: float, down: bool, growth: float, dilution: float, volume_ml: float) -> float:
-    """mL that `minutes` need: full rate on the way down, none on the way up, then as much as grows."""
+    """Sum the mL that `minutes` need: full rate on the way down, none on the way up, then as much as grows."""
     held = max(minutes - reached, 0.0) * growth
     return volume_ml * (held + (min(minutes, reached) * dilution if down else 0.0))
 
@@ -114,13 +114,13 @@ def _device(setup: Setup) -> Iterator[str]:
 
 
 def _start_od(setup: Setup, scenario: Scenario) -> float:
-    """The OD a reactor starts from, as far as that is known; else the one its first step asks for."""
+    """Return the OD a reactor starts from, as far as that is known; else the one its first step asks for."""
     known = setup.family.start_od(setup.backend, setup.plant)
     return max(known, scenario.recovery_od) or scenario.setpoints[0]
 
 
 def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: datetime) -> Iterator[str]:
-    """The steps of one reactor, each in a line, and whether its medium lasts."""
+    """List the steps of one reactor, each in a line, and whether its medium lasts."""
     growth, volume_ml = setup.model.mu, setup.bench.volume_of(name)
     dilution = setup.model.max_pump_rate / setup.model.tau * (setup.bench.volume_ml / volume_ml)
     od, at, ml, most = max(_start_od(setup, scenario), 1e-3), 0.0, 0.0, 0.0
@@ -151,7 +151,7 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
 
 
 def _spare(scenario: Scenario, k: int, minutes: float) -> dict[int, float]:
-    """What each spare pump gives in so many minutes of a step, mL."""
+    """Sum what each spare pump gives in so many minutes of a step, mL."""
     outputs = outputs_of(scenario.outputs[k]) if scenario.outputs else ()
     return {o.pump: o.ml + o.ml_h * minutes / 60.0 for o in outputs}
 

@@ -73,7 +73,7 @@ class Watches(Protocol):
     """A controller that learns from every believed reading, also before the schedule begins, and from temperature."""
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Called before each `act`; arguments as there, `rows` also in recovery; temperature: degC, nan if unknown."""
+        """Watch a sample before each `act`; arguments as there, also in recovery; temperature: degC, nan if unknown."""
         ...
 
 

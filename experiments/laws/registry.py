@@ -124,7 +124,7 @@ def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
 
 
 def on_device(kind: str) -> str:
-    """The law of the density itself, if it needs no simulated plant. Raises: ValueError naming those that do not."""
+    """Return the law of the density, if it needs no simulated plant. Raises: ValueError naming those that do not."""
     known = [name for name, law in KINDS[DENSITY].items() if "plant" not in law.parts]
     if kind not in known:
         raise ValueError(f"controller_kind = {kind}: allowed {', '.join(known)}")
@@ -132,7 +132,7 @@ def on_device(kind: str) -> str:
 
 
 def config(kind: str, signal: str = DENSITY) -> Any:
-    """The default config of a law. Raises: ValueError naming the laws there are."""
+    """Return the default config of a law. Raises: ValueError naming the laws there are."""
     return _kind(kind, signal).config()
 
 
@@ -149,7 +149,7 @@ def build(
     volume_ml: Array | float = Bench.volume_ml,
     pair: PairConfig | None = None,
 ) -> Any:
-    """The law that a config describes, a `Controller` of the density or a `Law` of the share.
+    """Build the law that a config describes, a `Controller` of the density or a `Law` of the share.
 
     Args:
       config: as `config` gives it; `kind` names the law.

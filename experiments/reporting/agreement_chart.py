@@ -58,7 +58,7 @@ def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervise
 
 
 def _compared(ax: Axes, c: Compared, label: str) -> None:
-    """A parameter's segments with their intervals over the model's value."""
+    """Draw a parameter's segments with their intervals over the model's value."""
     ax.axhline(c.expected, color="black", lw=1.0, ls="--", label="model")
     known = [(a / 60, b / 60, p) for a, b, p in zip(c.first_min, c.end_min, c.found, strict=True) if p is not None]
     if known:

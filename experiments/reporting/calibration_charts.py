@@ -59,7 +59,7 @@ def _residuals(ax: Axes, hours: Array, residual: Array) -> None:
 
 
 def _innovations(ax: Axes, hours: Array, innovation: Array, correlation: float) -> None:
-    """What each reading adds to those before it; two in three lie within 1 sd, 95 % within the band."""
+    """Draw the innovation of each reading; two in three lie within 1 sd, 95 % within the band."""
     ax.axhspan(-1.96, 1.96, color=MODEL, alpha=0.08, lw=0)
     ax.axhline(0.0, color="0.6", lw=0.8)
     ax.plot(hours, innovation, ".", ms=3, color=DATA)
@@ -77,7 +77,7 @@ def _model_label(result: Calibration) -> str:
 
 
 def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
-    """Readings by their fate; rejected ones beyond the scale sit as triangles on the upper edge."""
+    """Draw readings, used and rejected; those beyond the scale are triangles on the upper edge."""
     hours, clean = raw.time / 60, result.screened.series.od
     a, b = result.window
     window = np.zeros(len(hours), dtype=np.bool_)
@@ -101,7 +101,7 @@ def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
 
 
 def drift_figure(result: Calibration, title: str) -> Figure:
-    """mu and tau of each segment fitted alone, beside the returned pair and its window."""
+    """Draw mu and tau of each segment fitted alone, beside the returned pair and its window."""
     figure, axes = new_figure(9.5, 6.2, 2, sharex=True)
     time = result.screened.series.time / 60
     a, b = result.window

@@ -47,7 +47,7 @@ matplotlib.rcParams.update(
 def new_figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **kwargs: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure and its axes, row by row; `kwargs` go to `Figure.subplots`."""
+    """Create a figure and its axes, row by row; `kwargs` go to `Figure.subplots`."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
 
@@ -214,7 +214,7 @@ def closed_loop(
     marks: Sequence[tuple[float, str]] = (),
     refused: Array | None = None,
 ) -> Figure:
-    """A recorded closed loop: OD over setpoint, above pump rate (and temperature).
+    """Draw a recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
       marks: minute and text of vertical lines. refused: OD that was not believed, (K, N); at the edge where it is far.

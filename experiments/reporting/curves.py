@@ -104,7 +104,7 @@ PICTURES = {
 
 
 def described(tag: str) -> str:
-    """What TensorBoard shows beside a tag; statistics of a population say which."""
+    """Describe a tag for TensorBoard; statistics of a population say which."""
     base, _, end = tag.rpartition("/")
     if base in CURVES and end in POPULATION:
         return f"{CURVES[base].text} {POPULATION[end].capitalize()}."
@@ -136,7 +136,7 @@ TRAINING: Mapping[str, Mapping[str, Chart]] = {
 
 
 def of_population(pages: Mapping[str, Mapping[str, Chart]]) -> Mapping[str, Mapping[str, Chart]]:
-    """The same charts of several agents: mean of the middle half, with the range of all as its band."""
+    """Build the same charts for several agents: mean of the middle half, with the range of all as its band."""
 
     def band(tag: str) -> tuple[str, str, str]:
         one = tag.startswith("limit/") or tag == "train/epsilon"

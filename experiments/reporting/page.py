@@ -90,7 +90,7 @@ class Page:
         self.add("figure", title=title, caption=caption, media=media, data=base64.b64encode(data).decode())
 
     def html(self) -> str:
-        """The whole document."""
+        """Render the whole document."""
         return templates.get_template("report.html.j2").render(page=self)
 
 
@@ -115,7 +115,7 @@ def _other_versions() -> str:
 
 
 def provenance(page: Page, run: Path) -> None:
-    """What was run: command, seed, versions, and the whole configuration to unfold."""
+    """Add what was run: command, seed, versions, and the whole configuration to unfold."""
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)
@@ -138,7 +138,7 @@ def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 def _config(text: str) -> Mapping[str, Any]:
-    """The configuration of a run; {} for one that cannot be read, or that refers to itself."""
+    """Read the configuration of a run; {} for one that cannot be read, or that refers to itself."""
     if len(text) > LARGEST or ALIAS.search(text):
         return {}
     try:
@@ -161,7 +161,7 @@ def _near(text: str) -> str:
 
 
 def _labelled(key: str, kind: str) -> str:
-    """A key of summary.json with its unit. Args: kind: of the task whose error it may be."""
+    """Label a key of summary.json with its unit. Args: kind: of the task whose error it may be."""
     *parents, name = key.split(".")
     unit = UNITS.get(parents[-1] if parents and name in ("value", "ci95") else name, "")
     if unit == "OD" and "error" in name:
@@ -192,7 +192,7 @@ def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
 
 
 def _told(runs: Iterable[Path]) -> list[Verdict]:
-    """What each run came to, of those that can say it."""
+    """List the verdicts of the runs that have one."""
     found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
     return [said for said in found if said is not None]
 
@@ -227,7 +227,7 @@ def _figures(page: Page, run: Path) -> None:
 
 
 def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
-    """The page of any command's run: what it found, and what was run. `runs` is the folder itself or runs below it.
+    """Build the page of any command's run: what it found, and what was run. `runs`: the folder itself or runs below it.
 
     Of several runs it begins with what each came to.
 

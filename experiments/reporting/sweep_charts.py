@@ -48,7 +48,7 @@ def learning_curves(curves: Sequence[tuple[str, Array, Array]], quantity: str) -
 
 
 def values(measured: Mapping[str, Array], quantity: str) -> Figure:
-    """A row per configuration, the best on top: a dot per seed or reactor, a bar at the interquartile mean.
+    """Draw a row per configuration, the best on top: a dot per seed or reactor, a bar at the interquartile mean.
 
     Args: measured: name -> (n,). quantity: with its unit.
     """

@@ -18,7 +18,7 @@ STATISTICS = ("n", "median", "IQM", "95 % of IQM", "worst")
 
 
 def repeats(command: str, one: Configuration) -> str:
-    """The command that runs a configuration again, with all its seeds."""
+    """Write the command that runs a configuration again, with all its seeds."""
     first = dict(one.jobs[0].overrides)
     for key in first:
         several = list(dict.fromkeys(job.overrides[key] for job in one.jobs if key in job.overrides))
@@ -47,7 +47,7 @@ def _row(place: int, one: Configuration, names: Sequence[str]) -> tuple[str, ...
 
 
 def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str], str], note: str) -> None:
-    """A table per measure, and folded away all of them side by side, as configurations.csv has them."""
+    """Add a table per measure, and folded away all of them side by side, as configurations.csv has them."""
     names = _measures(ranked)
     for name in names:
         rows = tuple(_row(k + 1, one, [name]) for k, one in enumerate(ranked))
@@ -61,7 +61,7 @@ def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str],
 
 
 def number_or_text(value: str) -> str:
-    """A number to four digits, anything else as it stands."""
+    """Format a number to four digits, anything else as it stands."""
     try:
         return number(float(value), 4)
     except ValueError:
@@ -93,7 +93,7 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
 
 
 def _missing(page: Page, jobs: Sequence[Result], again: str) -> None:
-    """The jobs that left nothing, by name."""
+    """Name the jobs without results."""
     left = [job for job in jobs if job.state != "finished"]
     if not left:
         return
@@ -126,7 +126,7 @@ def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: 
 
 
 def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> Page:
-    """The page of a sweep.
+    """Build the page of a sweep.
 
     Args: jobs: all of them, also those without a result. again: the command that does what is missing.
     """

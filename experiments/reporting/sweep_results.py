@@ -57,7 +57,7 @@ class Configuration:
 
 
 def _short(value: str) -> str:
-    """A number to four digits."""
+    """Format a number to four digits."""
     try:
         return f"{float(value):.4g}"
     except ValueError:
@@ -88,14 +88,14 @@ def statistics(values: Array) -> Statistics:
 
 
 def label(measure: str, task: str, command: str) -> str:
-    """A measure with its unit."""
+    """Label a measure with its unit."""
     if (measure, command) == ("objective", "train"):
         return MERIT
     return LABELS.get(measure, measure).format(unit=ERROR_UNITS.get(task, ""))
 
 
 def measures(summary: Mapping[str, Any]) -> dict[str, list[float]]:
-    """What a run measured: name -> a value per seed or reactor, or one. Which numbers those are depends on the command.
+    """Collect what a run measured: name -> a value per seed or reactor, or one. The names depend on the command.
 
     A training has them per seed. A closed loop has them per window: ISE and ITAE are summed over the windows of a
     reactor, the steady error is that of its worst window. Of any other command these are its plain numbers.
@@ -155,7 +155,7 @@ def _rank(one: Configuration) -> float:
 
 
 def curve(jobs: Sequence[Result], tag: str) -> tuple[Array, Array]:
-    """A tag of progress.csv: steps (K,), and a column per seed of all jobs, (K, S), nan where a seed has no value."""
+    """Read a tag of progress.csv: steps (K,), and a column per seed of all jobs, (K, S), nan without a value."""
     found: dict[tuple[str, str], dict[int, float]] = {}
     for job in jobs:
         try:

@@ -29,7 +29,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
-    """mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
+    """Format mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
@@ -52,7 +52,7 @@ def count(n: int, one: str) -> str:
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in Markdown, with its last line end."""
+    """Format a table in Markdown, with its last line end."""
     head, *body = ("| " + " | ".join(map(str, row)) + " |" for row in (columns, *rows))
     return "\n".join([head, "|" + "---|" * len(columns), *body]) + "\n"
 
@@ -64,7 +64,9 @@ def typeset(text: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Best`; the first names
+    """Table with headings and rows, written in several formats.
+
+    name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Best`; the first names
     the row.
 
     Raises: ValueError for a row of another length than the headings.
@@ -90,7 +92,7 @@ class Table:
         return out.getvalue()
 
     def latex(self) -> str:
-        """A booktabs table, to be read with \\input."""
+        """Format a booktabs table, to be read with \\input."""
         lines = [
             r"\begin{table}",
             rf"\caption{{{_tex(self.title)}}}\label{{tab:{self.name}}}",

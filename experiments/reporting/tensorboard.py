@@ -66,7 +66,7 @@ class Events:
             self.flush()
 
     def _point(self, tag: str, number: float) -> Summary.Value:
-        """A value; the first of a tag says what the tag means."""
+        """Build a value; the first of a tag says what the tag means."""
         point = Summary.Value(tag=tag, tensor=TensorProto(dtype=DT_FLOAT, float_val=[number], tensor_shape=NUMBER))
         if tag not in self._known:
             self._known.add(tag)
@@ -78,7 +78,7 @@ class Events:
         self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
     def picture(self, tag: str, png: Path, step: int) -> None:
-        """A PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
+        """Write a PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
         data = png.read_bytes()
         size = [str(int.from_bytes(data[i : i + 4], "big")).encode() for i in (16, 20)]  # width and height
         shown = TensorProto(dtype=DT_STRING, string_val=[*size, data], tensor_shape=THREE)
@@ -86,13 +86,13 @@ class Events:
         self._add([Summary.Value(tag=tag, tensor=shown, metadata=said)], step)
 
     def text(self, tag: str, markdown: str, step: int = 0) -> None:
-        """A text in Markdown."""
+        """Write a text in Markdown."""
         said = text.create_summary_metadata("", "")
         line = TensorProto(dtype=DT_STRING, string_val=[markdown.encode()], tensor_shape=LINE)
         self._add([Summary.Value(tag=tag, tensor=line, metadata=said)], step)
 
     def layout(self, categories: Mapping[str, Mapping[str, Chart]]) -> None:
-        """What the custom page shows: category -> title -> chart."""
+        """Write what the custom page shows: category -> title -> chart."""
         made = layout_pb2.Layout(
             category=[
                 layout_pb2.Category(title=name, chart=[_chart(title, chart) for title, chart in charts.items()])
@@ -104,7 +104,7 @@ class Events:
         self._add([Summary.Value(tag=custom.CONFIG_SUMMARY_TAG, tensor=line, metadata=said)], 0)
 
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
-        """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
+        """Write a row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
         Whatever else was given on the command line is a column of its own, so that a sweep has one for what it varies.
         TensorBoard shows the columns of one run alone, the first that it meets: in one column are all of them.
@@ -166,7 +166,7 @@ def _number(text: str) -> float | str:
 
 
 def _ordered(key: str) -> str:
-    """A name that sorts as `PARAMETERS` are written; its title is what is shown."""
+    """Return a name that sorts as `PARAMETERS` are written; its title is what is shown."""
     return f"{[*PARAMETERS, key].index(key)}_{key}"
 
 

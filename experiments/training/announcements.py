@@ -93,7 +93,7 @@ def ended(
 
 
 def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path) -> None:
-    """The custom page of TensorBoard and the configuration, at the start."""
+    """Write the custom page of TensorBoard and the configuration, at the start."""
     writer.events.layout(TRAINING if len(seeds) == 1 else of_population(TRAINING))
     path = folder / "config.yaml"
     if path.is_file():
@@ -112,7 +112,7 @@ def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Seque
 
 
 def results(writer: PopulationWriter, step: int, kept: Score, task: Task, seeds: Sequence[int]) -> None:
-    """What the HPARAMS table and the text page show at the end."""
+    """Write what the HPARAMS table and the text page show at the end."""
     for events, regret, steady in zip(writer.agents, kept.regret_pct, kept.steady_abs_error, strict=False):
         events.scalars({"result/regret_pct": float(regret), "result/steady_abs_error": float(steady)}, step)
     limits = ("limit", f"{task.regret_unit:g}", f"{task.steady_unit:g}")

@@ -43,7 +43,7 @@ def trainer(task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "c
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:
-    """The greedy policies of weights (S, P) as a function on NumPy grids."""
+    """Turn weights (S, P) into greedy policies on NumPy grids."""
     network = network.with_weights(flat)
 
     def act(observation: np.ndarray) -> np.ndarray:

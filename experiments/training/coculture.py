@@ -89,7 +89,7 @@ class Coculture:
         return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.06, 0.94, 8))
 
     def report_grid(self) -> Array:
-        """Starts .05 to .95 x setpoints .1 to .9; with preview a change between each two of these setpoints."""
+        """Pair starts .05 to .95 with setpoints .1 to .9; with preview, add a change between each two setpoints."""
         return self._grid(np.linspace(0.1, 0.9, 9), np.linspace(0.05, 0.95, 19))
 
     def _grid(self, setpoints: Array, starts: Array) -> Array:
@@ -107,14 +107,14 @@ class Coculture:
         return np.concatenate([at_rest(c, now), np.stack([now, following, time], axis=1)], axis=1)
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """The model and the program one decision on; r - setpoint."""
+        """Advance the model and the program by one decision; r - setpoint."""
         c = self.config
         state = advance(c, observation[..., :3], self.actions[action], c.control_min)
         error = share(state[..., LOGIT]) - share(observation[..., SETPOINT])
         return np.concatenate([state, passed(c, observation[..., 3:])], axis=-1), error
 
     def asked(self, start: Array) -> Array:
-        """The last setpoint of the episode."""
+        """Return the last setpoint of the episode."""
         return np.asarray(start[:, NEXT if self.config.preview_min else SETPOINT].round(9))
 
     def best(self, start: Array) -> Rollout:
@@ -139,7 +139,7 @@ class Coculture:
         return run
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """The temperature after which the share is nearest to the setpoint in force."""
+        """Choose the temperature after which the share is nearest to the setpoint in force."""
         flat = observation.reshape(-1, observation.shape[-1])
         action = best_action(self.config, None, None, flat[:, :3], share(flat[:, SETPOINT]))
         return action.reshape(observation.shape[:-1])

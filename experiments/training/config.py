@@ -16,7 +16,7 @@ ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, 
 
 
 def env_schema(kind: str) -> Any:
-    """The default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
+    """Return the default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
     if kind not in ENVS:
         raise ValueError(f"env.kind = {kind}: allowed {', '.join(ENVS)}")
     return ENVS[kind]()

@@ -68,13 +68,13 @@ class Density:
         return pairs(starts, np.unique(self.config.setpoints))
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """x <- f_a x; x - setpoint."""
+        """Advance x <- f_a x; x - setpoint."""
         setpoint = observation[..., 1]
         od = np.minimum(observation[..., 0] * self._factors[action], MAX_OD)
         return np.stack([od, setpoint], axis=-1), od - setpoint
 
     def asked(self, start: Array) -> Array:
-        """The setpoint."""
+        """Return the setpoint."""
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
@@ -119,7 +119,7 @@ class Density:
 
 
 def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp]:
-    """The optimum's first action of an episode from each OD towards each setpoint, (G,), (G,) -> (G,).
+    """Return the optimum's first action of an episode from each OD towards each setpoint, (G,), (G,) -> (G,).
 
     The model is linear in x, so that the best action depends on x / setpoint alone, and one solution serves all.
     """

@@ -60,11 +60,11 @@ class Evaluated(Protocol):
         ...
 
     def asked(self, start: Array) -> Array:
-        """What the steady errors of episodes with starts (G, O) are grouped by, e.g. the setpoint, (G,)."""
+        """Return what groups the steady errors of episodes with starts (G, O), e.g. the setpoint, (G,)."""
         ...
 
     def best(self, start: Array) -> Rollout:
-        """The optimum of each episode from starts (G, O), as the only policy (S = 1) of a rollout."""
+        """Solve each episode from starts (G, O); the optimum is the only policy (S = 1) of the rollout."""
         ...
 
 
@@ -74,7 +74,7 @@ def pairs(first: Array, second: Array) -> Array:
 
 
 def each(policy: Policy) -> Act:
-    """A policy file as the only policy (S = 1) of a rollout."""
+    """Use a policy file as the only policy (S = 1) of a rollout."""
     return lambda observation: policy.act(observation[0])[None]
 
 

@@ -71,13 +71,13 @@ class Relative:
         return pairs(e, low + (high - low) * (np.arange(shares) + place) / shares)
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """e <- e + s - v; e itself."""
+        """Advance e <- e + s - v; e itself."""
         s = observation[..., 1]
         error = observation[..., 0] + s - self.actions[action]
         return np.stack([error, s], axis=-1), error
 
     def asked(self, start: Array) -> Array:
-        """The growth share."""
+        """Return the growth share."""
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
@@ -90,11 +90,11 @@ class Relative:
         return Rollout(error, error, action)
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """The level nearest to e + s."""
+        """Choose the level nearest to e + s."""
         return nearest_level(observation[..., 0], observation[..., 1], self.actions.size)
 
     def model(self) -> dict[str, Any]:
-        """The range of what it was trained on."""
+        """Describe the range of growth shares of the training."""
         return {"model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:

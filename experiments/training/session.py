@@ -144,7 +144,7 @@ class Session:
         return announcements.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
     def report(self) -> tuple[Evaluation, Score, Score]:
-        """The reported grid with the scores of the kept policies and of the last iterates on it."""
+        """Score the kept policies and the last iterates on the reported grid."""
         report = Evaluation(self.task, self.task.report_grid())
         kept, last = (
             report(build.act_with(self.agents.network, weights), self.agents.n_agents)

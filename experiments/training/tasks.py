@@ -59,19 +59,19 @@ class Task(Evaluated, Protocol):
         ...
 
     def selection_grid(self) -> Array:
-        """Starts, (G, O), on which policies are compared during training."""
+        """Return the starts, (G, O), on which policies are compared during training."""
         ...
 
     def report_grid(self) -> Array:
-        """The reported grid; shares no point with `selection_grid`."""
+        """Return the reported grid; it shares no point with `selection_grid`."""
         ...
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """The one-line law: the action whose next error is smallest, (..., O) -> (...)."""
+        """Choose the action whose next error is smallest (one-line law), (..., O) -> (...)."""
         ...
 
     def model(self) -> dict[str, Any]:
-        """What a policy file says of what it was trained on."""
+        """Describe the model that a policy was trained on, for its file."""
         ...
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
@@ -100,10 +100,10 @@ def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) ->
 
 
 def kind(config: Any) -> str:
-    """The name under which the config of an environment is known."""
+    """Return the name under which the config of an environment is known."""
     return next(name for name, known in ENVS.items() if known is type(config))
 
 
 def of(config: Any) -> Task:
-    """The task of an environment's config."""
+    """Return the task of an environment's config."""
     return TASKS[type(config)](config)

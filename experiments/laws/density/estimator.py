@@ -201,7 +201,7 @@ class Estimator:
         self._trend[idx] = np.where(anew, 0.0, np.where(far, self._trend[idx], trend))
 
     def _learn(self, idx: NDArray[np.intp], observed: Array) -> None:
-        """The noise variance over the assumed one, as an average that begins with five readings' weight of 1."""
+        """Learn the noise variance over the assumed one, as an average that begins with five readings' weight of 1."""
         if not self.config.noise_memory:
             return
         self._learned[idx] += 1.0
@@ -244,7 +244,7 @@ class Estimator:
             return np.asarray(self._squares.mean(axis=1) < QUIET)
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
-        """Standard deviations of the error e and of the growth share s of `relative`, by the filter itself, each (N,).
+        """Return the filter's standard deviations of the error e and of the growth share s of `relative`, each (N,).
 
         To first order, with what ln x, mu and g have in common: at rest mu = g u / tau is known better than either.
         B is taken as known for e, as the proof has it, which takes an error of the gain by itself.
@@ -256,7 +256,7 @@ class Estimator:
         return np.sqrt(self.cov[:, LOG_OD, LOG_OD]) / self.full_pump, np.sqrt(np.maximum(variance, 0.0))
 
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
-        """The same as they are told: with B's part in e, and as much larger as surprises lately were than usual.
+        """Return the standard deviations for the user: with B's uncertainty in e, scaled by recent innovations.
 
         That of s is of the share that holds the culture at rest, which changes beside the filter's error of it.
         """
@@ -271,6 +271,6 @@ class Estimator:
         return error * larger, np.hypot(share * larger, SHARE_SD)
 
     def explain(self) -> dict[str, Array]:
-        """The estimates: OD, growth rate (1/min), relative pump gain, sd of a reading over the assumed one."""
+        """Explain the estimates: OD, growth rate (1/min), relative pump gain, sd of a reading over the assumed one."""
         od, mu, gain = np.exp(self.mean[:, LOG_OD]), self.mean[:, MU].copy(), self.mean[:, GAIN].copy()
         return {"od_estimate": od, "mu": mu, "gain": gain, "noise": np.sqrt(self._noise)}

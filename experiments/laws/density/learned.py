@@ -35,7 +35,7 @@ class LearnedConfig(ControllerConfig):
 
 
 def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: EstimateBounds | None) -> Controller:
-    """The controller that fits a policy's observation.
+    """Build the controller that fits a policy's observation.
 
     Args: bounds: of the policy's certificate, within which it may act; None where it has none.
     Raises: ValueError for settings that do not exist or fit.
@@ -51,7 +51,7 @@ def _estimator(policy: Policy, changes: Mapping[str, Any]) -> EstimatorConfig:
 
 
 def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """What decides beside a policy's network, by the names of settings; a certificate is of these, too.
+    """Collect the settings that decide beside a policy's network; a certificate names them, too.
 
     Args: changes: of its estimator. Raises: ValueError for settings that do not exist or fit.
     """

@@ -87,7 +87,7 @@ class Problem:
         return moves
 
     def by_gradient(self, start: Array) -> Array:
-        """Moves by L-BFGS-B in the box [0, 1] from `start`, row by row, shape (R, H)."""
+        """Optimise moves by L-BFGS-B in the box [0, 1] from `start`, row by row, shape (R, H)."""
         from scipy.optimize import minimize
 
         moves = np.empty_like(start)
@@ -164,5 +164,5 @@ class Mpc:
         return self._rate.copy()
 
     def explain(self) -> dict[str, Array]:
-        """The plan behind the last decision: pump rates in mL/s and predicted OD, both (N, horizon)."""
+        """Explain the last decision by its plan: pump rates in mL/s and predicted OD, both (N, horizon)."""
         return {"planned_rate": self._moves * self.model.max_pump_rate, "predicted_od": self._predicted.copy()}

@@ -32,7 +32,7 @@ class OracleConfig(ControllerConfig):
 def _value(
     mu: float, tau: float, control_min: float, max_rate: float, levels: int, gamma: float, grid: int
 ) -> OptimalPolicy:
-    """The optimum of setpoint 1 for one vial; the model is linear in x, so V_s(x) = s^2 V_1(x/s) for any setpoint s."""
+    """Solve setpoint 1 for one vial; the model is linear in x, so V_s(x) = s^2 V_1(x/s) for any setpoint s."""
     model = EnvConfig(mu, tau, control_min=control_min, n_actions=levels, max_pump_rate=max_rate, start_od=SPAN)
     return solve(model, gamma, np.array([1.0]), grid)
 
@@ -63,7 +63,7 @@ class Oracle:
         self._values = np.stack([s.value[0] for s in solved])
 
     def reset(self, n: int) -> None:
-        """It has no memory. Raises: ValueError unless n is the plant's number of vials."""
+        """Check the number of vials; there is no memory. Raises: ValueError unless n is the plant's number of vials."""
         if n != self.plant.n:
             raise ValueError(f"oracle of a plant with {self.plant.n} vials: allowed {self.plant.n} reactors, not {n}")
 

@@ -78,7 +78,7 @@ class ChiBioPI:
         return self._rate.copy()
 
     def explain(self) -> dict[str, Array]:
-        """The three parts of the last decision, mL/s."""
+        """Explain the last decision by its three parts, mL/s."""
         return {"p": self._p.copy(), "i1": self._i1.copy(), "i2": self._i2.copy()}
 
 
@@ -135,5 +135,5 @@ class TunedPI:
         return self._rate.copy()
 
     def explain(self) -> dict[str, Array]:
-        """The two parts of the next decision as dilution rates, 1/min."""
+        """Explain the next decision by its two parts, dilution rates in 1/min."""
         return {"p": self._p.copy(), "i": self._integral.copy()}

@@ -31,7 +31,7 @@ class Estimate:
     thermometer: Array
 
     def of(self, idx: NDArray[np.intp]) -> "Estimate":
-        """What is believed of some of the cultures."""
+        """Return the estimate of some of the cultures."""
         return Estimate(*(getattr(self, f.name)[idx] for f in fields(self)))
 
     @property
@@ -41,7 +41,7 @@ class Estimate:
 
     @property
     def share(self) -> Array:
-        """r = 1 / (1 + exp(-logit)), (N,)."""
+        """Compute r = 1 / (1 + exp(-logit)), (N,)."""
         return 1.0 / (1.0 + np.exp(-self.logit))
 
     @property
@@ -76,7 +76,7 @@ class ShareEstimator(Remembers, Protocol):
         ...
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """A sample: OD, counts, degC, min since the run began; rows: True where it is new and believed."""
+        """Watch a sample: OD, counts, degC, min since the run began; rows: True where it is new and used."""
         ...
 
     def dosed(self, volume_ml: Array) -> None:
@@ -102,11 +102,11 @@ class ShareEstimator(Remembers, Protocol):
         ...
 
     def estimate(self) -> Estimate:
-        """What is believed now."""
+        """Return the current estimate."""
         ...
 
     def explain(self) -> dict[str, Array]:
-        """The estimate for recording and journal: ratio, ratio_low, ratio_high and more."""
+        """Explain the estimate for recording and journal: ratio, ratio_low, ratio_high and more."""
         ...
 
 

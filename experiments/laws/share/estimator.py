@@ -69,7 +69,9 @@ class CompositionEstimatorConfig:
 
 
 class CompositionEstimator:
-    """State z = [x, ln S, ln f, d, b_e, b_p, g, k, o, c]: logit of the share of P. putida, OD of both species, pigment,
+    """Extended Kalman filter for the composition of N cultures.
+
+    State z = [x, ln S, ln f, d, b_e, b_p, g, k, o, c]: logit of the share of P. putida, OD of both species, pigment,
     error of its production, errors of the two growth curves, true over calibrated flow of the pump, factor and offset
     of the light sensor, true less measured temperature. With e = S/(1 + exp x) and p = S - e, and over h hours in which
     v of V mL were replaced
@@ -156,7 +158,7 @@ class CompositionEstimator:
         return self._given_ml
 
     def gave(self, volume_ml: Array, rows: Mask) -> None:
-        """That it was so much since the newest readings of `rows`, mL, (N,), whatever was told of these."""
+        """Set the volume delivered since the newest readings of `rows`, mL, (N,), in place of what was told before."""
         self._given_ml = np.where(rows, volume_ml, self._given_ml)
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
@@ -281,7 +283,7 @@ class CompositionEstimator:
         self._production[idx] = np.maximum(wanted, pigment.least)
 
     def _seen(self, z: Array, which: int) -> tuple[Array, Array]:
-        """Expected reading of states (..., 10) and its slope, (...) and (..., 10). Args: which: OD, LIGHT or SAMPLE."""
+        """Return the expected reading of states (..., 10) and its slope (..., 10). Args: which: OD, LIGHT or SAMPLE."""
         od, f, k = np.exp(z[..., LOG_OD]), np.exp(z[..., LOG_F]), z[..., FACTOR]
         slope = np.zeros_like(z)
         if which == OD:
@@ -333,7 +335,7 @@ class CompositionEstimator:
         return np.maximum(least, (least**-1 + sum_of) / (least**-2 + known))
 
     def _judge_dose(self, idx: Rows, squared: Array, spread: Array, od: Array, believed: Mask) -> None:
-        """What an OD after a dose says of how doses spread.
+        """Learn the spread of doses from an OD after a dose.
 
         A squared error e^2 beyond what else explains it, over D = (OD v/V)^2, is an estimate of the squared spread with
         variance 2 (E e^2)^2 / D^2. These are averaged by their precision, over some sixty doses, together with the
@@ -346,7 +348,7 @@ class CompositionEstimator:
         self._doses[idx] += given * (np.stack([precision, sum_of], axis=-1) - self._doses[idx] / DOSES)
 
     def _density_anew(self, idx: Rows, start: Rows, od: Array) -> None:
-        """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
+        """Accept a density that jumped and stays; the pigment may have gone with it, as by a dose nobody told."""
         found = np.log(np.maximum(od, LOWEST_OD))
         jump = found - self.mean[idx, start, LOG_OD]
         self.mean[idx, start, LOG_OD], self.mean[idx, start, LOG_F] = found, self.mean[idx, start, LOG_F] + jump
@@ -365,7 +367,7 @@ class CompositionEstimator:
         self.cov[idx, start, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
 
     def _update(self, idx: Rows, which: int, reading: Array, noise: Array, on: Mask | None = None) -> None:
-        """Iterated update in Joseph's form, which holds for any gain; that of what is only considered is zero.
+        """Update iteratively in Joseph's form, which holds for any gain; states that are only considered keep gain 0.
 
         Args: reading and variance of its noise, (n,). on: starts that learn from it, (n, K); None: all.
         """
@@ -429,7 +431,7 @@ class CompositionEstimator:
 
 
 def _square(a: Array) -> Array:
-    """a a', (..., S, S) of (..., S)."""
+    """Return a a', (..., S, S) of (..., S)."""
     return np.asarray(a[..., :, None] * a[..., None, :])
 
 

@@ -68,7 +68,7 @@ class Periodic(ABC, Generic[Config]):
 
     @abstractmethod
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        """True temperatures for the rows `idx`, whose estimates and wishes are given, degC; clipped by the caller."""
+        """Decide true temperatures for the rows `idx`, whose estimates and wishes are given, degC; the caller clips."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,9 @@ class InverseDynamicsConfig(LawConfig):
 
 
 class InverseDynamics(Periodic[InverseDynamicsConfig]):
-    """The temperature at which the first species, which answers at once, makes the error vanish like exp(-t / reach):
+    """Law of inverse dynamics: the error vanishes like exp(-t / reach).
 
+    It takes the temperature at which the first species, which answers at once, grows by
     (1 + b_e) mu_e(T) = m_p - (logit s - logit r) / reach
     """
 

@@ -31,12 +31,14 @@ class PreviewLawConfig(LearnedLawConfig):
 
 
 def _unnamed(pair: PairConfig) -> PairConfig:
-    """A pair whose species are called by numbers."""
+    """Return a pair whose species are called by numbers."""
     return replace(pair, first=replace(pair.first, name="1"), second=replace(pair.second, name="2"))
 
 
 class LearnedLaw(Periodic[LearnedLawConfig]):
-    """T = actions[argmax_a Q(o, a)] with o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
+    """Law of a learned policy, T = actions[argmax_a Q(o, a)].
+
+    The observation is o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
     setpoint, minutes until then].
 
     Shown in place of m_p is m_p - (b_e - b) mu_e(33.2): an error b_e of the other curve, beyond the b that it was

@@ -23,7 +23,7 @@ def _ahead(model: CocultureConfig, setpoints: tuple[float, ...]) -> Array:
 
 
 def _best(model: CocultureConfig, value: Array | None, estimate: Estimate, setpoint: Array) -> Array:
-    """The temperature that is best now, by the estimated curves; what comes after it by the model's."""
+    """Choose the best temperature now, by the estimated curves; what comes after it by the model's."""
     chosen = best_action(model, transitions(model), value, estimate.state, setpoint, estimate.errors)
     return np.asarray(model.targets()[chosen])
 

@@ -71,7 +71,7 @@ class Program:
         return np.where((at < 0.0) | none, np.nan, wanted)
 
     def wanted(self, minute: Array, preview_min: float = 0.0) -> Wanted:
-        """What a law is told at each minute since the program began, (N,).
+        """Return what a law is told at each minute since the program began, (N,).
 
         Args: preview_min: how long before it a change is announced; 0: never. Only a change from one share to another
           is one. A sine is announced as a step: in 120 min to its share in 300, or both shorter by `preview_min` < 300.

@@ -92,7 +92,7 @@ class Recall:
         self._catch_up()
 
     def _begin(self, now: float) -> None:
-        """A new chapter; what is older than two days is forgotten, but for what is just taken again."""
+        """Begin a new chapter; forget what is older than two days, except what is just being replayed."""
         self._chapters.append(Chapter(now, copy.deepcopy(self.estimator)))
         while now - self._chapters[0].minute > KEPT_MIN and (self._again is None or self._again.chapter > 0):
             self._chapters.pop(0)
@@ -126,7 +126,7 @@ class Recall:
         return True
 
     def retell(self, shown: Iterable[Shown]) -> None:
-        """What a resumed run was shown in its earlier lives, in order, behind what is `known`: it is taken again.
+        """Replay what a resumed run was shown in its earlier lives, in order, after what is `known`.
 
         Until it has caught up the estimate is that which was saved.
         """
@@ -153,7 +153,7 @@ class Recall:
         act(*arguments)
 
     def _catch_up(self) -> None:
-        """Some more of the past; where all of it has been taken, the copy is the estimator."""
+        """Replay some more of the past; once all of it is replayed, the copy becomes the estimator."""
         again = self._again
         for _ in range(AT_ONCE):
             if again is None:
@@ -171,7 +171,7 @@ class Recall:
                 self._chapters[again.chapter].then = copy.deepcopy(again.estimator)
 
     def estimate(self) -> Estimate:
-        """What is believed now."""
+        """Return the current estimate."""
         return self.estimator.estimate()
 
     def explain(self) -> dict[str, Array]:
