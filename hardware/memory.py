@@ -45,7 +45,7 @@ class Words(NamedTuple):
 
 
 def words(path: str) -> Words:
-    """The refusals of a state that stands under `path`."""
+    """Build the refusals of a state stored under `path`."""
     shape = f"{path}.{{key}} has shape {{found}}, this run needs {{shape}}"
     return Words(
         f"{path}: {{value}}, expected keys and values", f"{path}.{{key}}: {{value}}, expected {{what}}", shape, shape
@@ -77,7 +77,7 @@ def restore(owner: Remembers, state: Any, said: Words) -> None:
 
 
 def row(owner: Remembers, n: int) -> dict[str, Any]:
-    """What `owner` remembers of reactor n, as `save`; an array that is padded with inf is saved without that."""
+    """Return what `owner` remembers of reactor n, as `save`; an array is saved without its padding of inf."""
     return {key: _plain(_unpadded(getattr(owner, _name(owner, key))[n])) for key in owner.remembers}
 
 
@@ -129,7 +129,7 @@ def _plain(value: Any) -> Any:
 
 
 def _fitted(now: NDArray[Any], key: str, value: Any, said: Words) -> NDArray[Any]:
-    """A saved value as an array like `now`. Raises: ValueError."""
+    """Convert a saved value to an array like `now`. Raises: ValueError."""
 
     def refused(form: str, what: str = "", found: tuple[int, ...] = ()) -> ValueError:
         text = {"key": key, "value": str(value)[:40], "what": what, "found": found, "shape": now.shape}

@@ -142,7 +142,7 @@ class Reactor(Protocol):
         ...
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """What was given beyond what receipts told, or less where negative: run time, s, and volumes, in order."""
+        """Return what was given beyond the receipts, or less where negative: run time, s, and volumes, in order."""
         ...
 
     def elapsed(self) -> float:
@@ -181,7 +181,7 @@ class KeepsLevels(Protocol):
 
 @contextmanager
 def left_off(reactors: Reactor) -> Iterator[None]:
-    """What ends here by an error or a stop leaves all pumps off, verified, and says so, or that it could not.
+    """Leave all pumps off and verified where this context ends by an error or a stop, or say that they are not.
 
     Raises: what ended it; DeviceStateError naming the pumps that could not be verified off.
     """

@@ -106,7 +106,7 @@ class SimulatedReactors:
         return self.pumps_off(rows)
 
     def heat_off(self, rows: Mask) -> list[str]:
-        """The heater of `rows` is off until a temperature is commanded. Nothing can fail."""
+        """Switch the heater of `rows` off until a temperature is commanded. Nothing can fail."""
         self._target = np.where(rows, 0.0, self._target)
         return []
 
@@ -146,7 +146,7 @@ class SimulatedFamily(Family):
         return "plant", plant
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """The vials themselves, and `pump_ml_s`."""
+        """Return the vials themselves, and `pump_ml_s`."""
         if not isinstance(reactors, SimulatedReactors):
             return None, 1.0
         return reactors.plant, reactors.config.pump_ml_s
@@ -156,7 +156,7 @@ class SimulatedFamily(Family):
         return "in this computer"
 
     def start_od(self, backend: SimulatedConfig, plant: PlantConfig) -> float:
-        """That of the vials."""
+        """Return the start OD of the vials."""
         return plant.start_od
 
 

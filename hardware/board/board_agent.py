@@ -164,7 +164,7 @@ KEPT = {  # None = the whole field
 
 
 def reduce_sysdata(body: bytes) -> bytes:
-    """The answer to GET /getSysdata/ with the fields a client needs; unchanged if it is not what is expected."""
+    """Reduce the answer to GET /getSysdata/ to the fields a client needs; leave an unexpected answer unchanged."""
     try:
         data = json.loads(body.decode("utf-8"))
         small = {}
@@ -279,7 +279,7 @@ class Agent:
         self._thread.start()
 
     def claim(self, line: str, session: int, arm: bool = True) -> str:
-        """A sign of life of the client in charge, "" then; for any other one why it is refused.
+        """Accept a sign of life of the client in charge and return ""; for any other client return why it is refused.
 
         Args: line, session: who asks. arm: False ends the watch until the next one, and whoever comes is in charge.
         """
@@ -298,7 +298,7 @@ class Agent:
         return ""
 
     def status(self) -> bytes:
-        """The JSON of HELLO, PING and BYE."""
+        """Return the JSON of HELLO, PING and BYE."""
         now, off = time.monotonic(), self._switched_off.items()
         answer = {
             "agent": "board_agent", "protocol": PROTOCOL, "version": VERSION, "deadman_s": self.deadman_s,
@@ -309,7 +309,7 @@ class Agent:
         return json.dumps(answer).encode("ascii")
 
     def answer_line(self, line: bytes) -> bytes:
-        """The reply frame for one received line; b"" for a line that is no frame."""
+        """Return the reply frame for one received line; b"" for a line that is no frame."""
         if b">" not in line:
             return b""
         request = decode_request(line)
@@ -381,7 +381,7 @@ class Agent:
         return problems
 
     def _state(self) -> dict:  # type: ignore[type-arg]
-        """The selected reactor's state. Raises: Unanswered, ValueError for an answer that is not JSON."""
+        """Read the selected reactor's state. Raises: Unanswered, ValueError for an answer that is not JSON."""
         status, body, _ = self.device.request("GET", "/getSysdata/")
         if status != 200:
             raise ValueError(f"getSysdata answered {status}")
@@ -530,7 +530,7 @@ OWN_POSTS = ("/_agent/heartbeat", "/_agent/bye")
 
 
 def parse_head(head: bytes) -> tuple[str, str, dict[str, str]]:
-    """METHOD, PATH and fields (names in lower case) of an HTTP request's head, given without the empty line after it.
+    """Parse METHOD, PATH and fields (names in lower case) of an HTTP request's head, without the empty line after it.
 
     Raises: Refusal for what is not one GET or POST without a body, and for a field that comes twice.
     """
@@ -561,7 +561,7 @@ def parse_head(head: bytes) -> tuple[str, str, dict[str, str]]:
 
 
 def read_token(path: str | None) -> bytes:
-    """The token that a file holds. Raises: ValueError for one that is missing, open to others or too short."""
+    """Read the token from a file. Raises: ValueError for one that is missing, open to others or too short."""
     if not path:
         raise ValueError("http without token-file: give --token-file FILE (docs/board_agent.md, The token)")
     try:
@@ -613,13 +613,13 @@ class Proxy(socketserver.ThreadingTCPServer):
             self.let_in(request)
 
     def let_in(self, request: socket.socket) -> None:
-        """It has shown the token, or is gone. Idempotent."""
+        """Release a request that has shown the token, or is gone. Idempotent."""
         with self._list:
             self._strangers.pop(request, None)
 
 
 def encode_answer(status: int, body: bytes, kind: str) -> bytes:
-    """An HTTP answer. No header opens it to a page of another origin."""
+    """Encode an HTTP answer. No header opens it to a page of another origin."""
     lines = [f"HTTP/1.1 {status} {REASONS.get(status, 'OK')}", f"Server: board_agent/{VERSION}", "Connection: close"]
     lines += [f"Content-Type: {kind}", "X-Content-Type-Options: nosniff", "Cache-Control: no-store"]
     lines += [f"Content-Length: {len(body)}"] * (status not in (204, 304))
@@ -686,7 +686,7 @@ class ProxyHandler(socketserver.BaseRequestHandler):
             raise Refusal(502 if problem.status == REFUSED else 504, str(problem)) from problem
 
     def _admit(self, fields: dict[str, str]) -> int:
-        """The session of a client that may ask. Raises: Refusal for a web page and for who does not know the token."""
+        """Admit a client and return its session. Raises: Refusal for a web page and for a client without the token."""
         host = re.sub(r":[0-9]{1,5}$", "", fields.get("host", "")).lower()
         if host not in self.server.names and host != self.request.getsockname()[0]:
             raise Refusal(

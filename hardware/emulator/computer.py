@@ -128,19 +128,19 @@ class Computer:
         return self.events.now
 
     def wall(self) -> float:
-        """The board's clock, s since 1970."""
+        """Return the board's clock, s since 1970."""
         return EPOCH + self.events.now + self.wall_offset_s
 
     def stamp(self) -> str:
-        """The board's clock as in the web page."""
+        """Format the board's clock as in the web page."""
         return datetime.fromtimestamp(self.wall(), UTC).strftime("%Y-%m-%d %H:%M:%S")
 
     def http_date(self) -> str:
-        """The board's clock as Flask writes a datetime."""
+        """Format the board's clock as Flask writes a datetime."""
         return format_datetime(datetime.fromtimestamp(int(self.wall()), UTC), usegmt=True)
 
     def uniform(self, low: float, high: float) -> float:
-        """A random number from the computer's own stream."""
+        """Draw a random number from the computer's own stream."""
         return float(self.rng.uniform(low, high))
 
     def bus(self, name: str) -> None:

@@ -141,7 +141,7 @@ class ChiBioDevice:
             self.faults.bus_stuck, self.faults.bus_stuck_when_pumping = True, False
 
     def _time_out(self) -> Steps:
-        """What a request that outlives the worker's time-out comes to."""
+        """End a request that outlives the worker's time-out."""
         self.supervisor.kill_worker()
         yield from ()
 
@@ -178,5 +178,5 @@ class ChiBioDevice:
         return exchange.answer[:2]
 
     def truth(self, name: str) -> dict[str, Any]:
-        """What only the emulator knows of one reactor. Raises: KeyError for a position without one."""
+        """Return what only the emulator knows of one reactor. Raises: KeyError for a position without one."""
         return {"device_s": self._events.now} | self.vials[name].truth(self._events.now)

@@ -57,7 +57,7 @@ class Experiment:
         self._position.terminal("Experiment Stopped")
 
     def _cut_short(self) -> Steps:
-        """A cycle that was stopped before its record does not count."""
+        """End a cycle that was stopped before its record: it does not count."""
         self._position.data["Experiment"]["cycles"] -= 1
         yield from self._finish()
 
@@ -125,7 +125,7 @@ class Experiment:
         yield from self._outputs.set_on("Stir", 1)
 
     def _store(self, started: float) -> Steps:
-        """Records, thinning, files."""
+        """Store records, thin them, write files."""
         data, experiment = self._position.data, self._position.data["Experiment"]
         if experiment["cycles"] % 10 == 9:
             clear_terminal(data, self._position.computer.stamp())

@@ -24,7 +24,7 @@ TWO = "coculture"  # preset of vials with two species
 
 
 def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
-    """The command line of the device's process."""
+    """Build the command line of the device's process."""
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
     arguments["volume"] = ",".join(f"{ml:g}" for ml in bench.volumes(backend.reactors))
     if (overflow := backend.overflow_pump).pump:

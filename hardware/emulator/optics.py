@@ -57,7 +57,7 @@ class Optics:
                 slot.update({"Base": base, "Emit1": first / base, "Emit2": second / base})
 
     def _light(self) -> tuple[float, float]:
-        """Counts of the base band and of pyoverdine's; a spectrometer that fails twice gives 1 and 0."""
+        """Count light of the base band and of pyoverdine's; a spectrometer that fails twice gives 1 and 0."""
         vial = self._position.hardware()
         if vial.faults.spectrometer_dead:
             return 1.0, 0.0

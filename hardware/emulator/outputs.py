@@ -27,11 +27,11 @@ class Position:
 
     @property
     def answers(self) -> bool:
-        """Does a reactor hang on the cable?"""
+        """Tell whether a reactor is connected to the cable."""
         return self.vial is not None and not self.vial.faults.unplugged
 
     def forget(self, selected: str) -> None:
-        """sysData as after power-on. A thread that runs keeps the parts of the old one it holds, as on the device."""
+        """Reset sysData as after power-on. A running thread keeps the old parts it holds, as on the device."""
         self.data: SysData = fresh_sysdata(self.device_id if self.answers else "", selected)
         self.terminal("System Initialised")
 
@@ -44,7 +44,7 @@ class Position:
         self.computer.spawn(steps, f"{self.name}/{what}")
 
     def hardware(self) -> Vial:
-        """The reactor behind the bus. Raises: BusStuck, ProcessDied (absent or unplugged reactor)."""
+        """Return the reactor behind the bus. Raises: BusStuck, ProcessDied (absent or unplugged reactor)."""
         self.computer.bus(self.name)
         if self.data["present"] == 0 or self.vial is None or self.vial.faults.unplugged:
             raise ProcessDied(f"access to absent reactor {self.name}")

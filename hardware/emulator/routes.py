@@ -37,7 +37,7 @@ class Exchange:
 
     @property
     def done(self) -> bool:
-        """Answered or given up?"""
+        """Tell whether the request was answered or given up."""
         return self.answer is not None or self.fate != ""
 
 

@@ -110,7 +110,7 @@ class EmulatorServer:
         return request
 
     def control(self, method: str, path: str) -> tuple[int, bytes]:
-        """The emulator's own routes: status and body."""
+        """Answer the emulator's own routes: status and body."""
         parts = path.removeprefix(PREFIX).strip("/").split("/")
         device = self.device
         with self.lock:
@@ -172,7 +172,7 @@ class _DevicePort(HTTPServer):
             connection.close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that goes away is not an error of the server."""
+        """Ignore a client that goes away: that is not an error of the server."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 

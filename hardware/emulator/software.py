@@ -50,7 +50,7 @@ class Software:
         }
 
     def app(self, name: str) -> ReactorApp:
-        """The app of a position as routes name it; "0" is the selected one. Raises: KeyError."""
+        """Return the app of a position as routes name it; "0" is the selected one. Raises: KeyError."""
         return self.apps[self.selected if name == "0" else name]
 
     def select(self, name: str) -> None:
@@ -66,7 +66,7 @@ class Software:
             self.select(str(rng.choice([m for m in self._reactors if m != self.selected])))
 
     def shown(self, name: str) -> None:
-        """A client was sent the records of reactor `name`, whole."""
+        """Note that a client was sent all records of reactor `name`."""
         app = self.apps[name]
         if app.vial is not None and app.data["time"]["record"]:
             app.vial.reads.append(self.computer.now())

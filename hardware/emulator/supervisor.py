@@ -46,7 +46,7 @@ class WebWorker:
             self._waiting.popleft().fate = "reset"
 
     def accept(self, exchange: Exchange) -> None:
-        """A request has arrived."""
+        """Accept a request that has arrived."""
         self._waiting.append(exchange)
         self._serve_next()
 
@@ -116,7 +116,7 @@ class Supervisor:
             vial.set_power(False, self._computer.now())
 
     def kill_worker(self) -> None:
-        """gunicorn replaces the worker: state wiped, requests wait until the new one has booted."""
+        """Replace the worker as gunicorn does: state wiped, requests wait until the new one has booted."""
         self._computer.note("worker killed")
         self._end_process()
         self._start_soon()

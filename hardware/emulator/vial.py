@@ -127,7 +127,7 @@ class Spectrometer:
         self._laser_since = at if on else np.nan
 
     def begin_exposure(self, at: float) -> None:
-        """The spectrometer starts integrating, and forgets what another thread had begun to integrate."""
+        """Start integrating light, and forget what another thread had begun to integrate."""
         self._lit_before = self._lit_s(at)
 
     def _lit_s(self, at: float) -> float:
@@ -192,7 +192,7 @@ class Vial:
         self._since: dict[str, tuple[float, float]] = {}
 
     def motor(self, pump: str) -> int:
-        """What the motor really does: 1, -1 or 0."""
+        """Return what the motor really does: 1, -1 or 0."""
         if not self.powered or self.faults.unplugged:
             return 0
         stuck = {FEED: self.faults.feed_stuck_open, WASTE: self.faults.waste_stuck_open}
@@ -206,7 +206,7 @@ class Vial:
             self._book(before, at)
 
     def set_power(self, on: bool, at: float) -> None:
-        """The watchdog's latch: without power every output is off, and stays off until it is written again."""
+        """Set the watchdog's latch: without power every output is off, and stays off until it is written again."""
         before = self._running(at)
         self.powered = on
         if not on:
@@ -247,7 +247,7 @@ class Vial:
         return float(self.plant.feed.delivered_ml[0]) if pump == FEED else self.supplied_ml.get(pump, 0.0)
 
     def _supply(self, seconds: float) -> float:
-        """What the spare pumps bring in meanwhile, mL; backwards they bring nothing."""
+        """Return what the spare pumps bring in meanwhile, mL; backwards they bring nothing."""
         flows = dict(zip(SPARE, (self.config.pump3_ml_s, self.config.pump4_ml_s), strict=True))
         fluid = {pump: flow * max(self.motor(pump), 0) * seconds for pump, flow in flows.items()}
         self.supplied_ml = {pump: self.supplied_ml[pump] + ml for pump, ml in fluid.items()}
@@ -295,7 +295,7 @@ class Vial:
         self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 
     def temperature(self, which: str, at: float) -> float:
-        """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
+        """Read a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
         self._nearly_sync(at)
         if which == "IR":
             value = float(self.plant.thermal.read()[0]) + self._rng.normal(0.0, 0.05)
@@ -315,7 +315,7 @@ class Vial:
         return float(np.round(self.plant.read_fluorescence()[0]))
 
     def truth(self, at: float) -> dict[str, Any]:
-        """What no client can know of the reactor at device time `at`."""
+        """Return what no client can know of the reactor at device time `at`."""
         self.sync(at)
         plant, vessel = self.plant, self.plant.vessel
         return {

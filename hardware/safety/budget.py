@@ -34,7 +34,7 @@ class FeedBudget:
         self._unusable = np.zeros(n)  # proposals in a row that were no rate
 
     def check(self, rate: Array, fresh: Mask, now: float) -> tuple[Array, list[Finding]]:
-        """What of the proposed feed rates passes, mL/s, shape (N,), and what is wrong with them."""
+        """Limit the proposed feed rates, mL/s, shape (N,), and report what is wrong with them."""
         c, bench = self._config, self._bench
         unusable = fresh & ~(np.isfinite(rate) & (rate >= 0.0))
         self._unusable = np.where(fresh, np.where(unusable, self._unusable + 1, 0), self._unusable)
@@ -60,7 +60,7 @@ class FeedBudget:
         return allowed, findings
 
     def _room(self, now: float) -> dict[str, Array]:
-        """mL that may still be fed, by what limits them, shape (N,) each."""
+        """Return the mL that may still be fed, by what limits them, shape (N,) each."""
         c = self._config
         self._roll(now)
         recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)

@@ -188,7 +188,7 @@ class SafetyConfig:
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
     def response(self, kind: str) -> Response:
-        """What is done about a reason. Raises: KeyError if there is none of that name."""
+        """Return the response to a reason. Raises: KeyError if there is none of that name."""
         return WORDS[getattr(self.responses, kind, RESPONSES[kind])]
 
     def ml_a_minute(self, bench: Bench) -> float:

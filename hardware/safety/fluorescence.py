@@ -26,7 +26,7 @@ class Light:
         self._light_s = np.full(n, math.nan)  # when a reading was last believed, or first asked for
 
     def check(self, m: Measurement, now: float) -> list[Finding]:
-        """What is wrong with the fresh readings of `m`; `now`: run time, s."""
+        """Find what is wrong with the fresh readings of `m`; `now`: run time, s."""
         if m.fluorescence is None:
             return []
         counts, fresh = m.fluorescence, np.asarray(m.fresh, dtype=np.bool_)
@@ -60,7 +60,7 @@ class Light:
 
 
 def _words(counts: float, repeats: float) -> str:
-    """A reading in words."""
+    """Put a reading into words."""
     if math.isnan(counts):
         return "no counts"
     return f"{counts:.0f} counts" + (f", the same in {repeats + 1:.0f} samples" if repeats else "")

@@ -131,7 +131,7 @@ class Interlock:
         return self._light.believed(measurement)
 
     def temperature(self, target: Array) -> Array:
-        """A composition controller's target as it may be commanded, degC, shape (N,): cut to the limits, nan stays.
+        """Cut a composition controller's target to the limits, degC, shape (N,); nan stays.
 
         The next `check` tells of what was cut.
         """
@@ -141,13 +141,13 @@ class Interlock:
         return np.asarray(allowed)
 
     def _cut(self) -> Finding:
-        """What `temperature` cut since the last call."""
+        """Report what `temperature` cut since the last call."""
         asked, self._asked_c = self._asked_c, np.full(self.n, math.nan)
         limits = f"{self.config.composition_low:g} to {self.config.composition_high:g}"
         return Finding("temperature_limit", ~np.isnan(asked), lambda i: f"{asked[i]:.1f} degC asked, allowed {limits}")
 
     def _reported(self, m: Measurement) -> list[list[_Reason]]:
-        """The faults that the reactors report themselves."""
+        """Collect the faults that the reactors report themselves."""
         faults = m.vitals.faults if m.vitals is not None else (None,) * self.n
         return [
             [_Reason(f.kind, self.config.response(f.kind), f"{f.detail}; {f.remedy}")] if f is not None else []
@@ -166,7 +166,7 @@ class Interlock:
                 self._hold_kind = np.where(finding.cool, float(list(REMEDIES).index(finding.kind)), self._hold_kind)
 
     def _add_holds(self, found: list[list[_Reason]], fresh: Mask, now: float) -> None:
-        """A reason to hold, where one was given a while ago and is not given again now."""
+        """Add a reason to hold, where one was given a while ago and is not given again now."""
         for i in np.flatnonzero(fresh & (now < self._hold_until_s)):
             kind = list(REMEDIES)[int(self._hold_kind[i])]
             if kind not in [reason.kind for reason in found[i]]:
@@ -174,7 +174,7 @@ class Interlock:
                 found[i].append(_Reason(kind, Response.HOLD, f"no dose for another {wait:.1f} min after this"))
 
     def _conclude(self, found: list[list[_Reason]], allowed: Array, setpoint: Array) -> Verdict:
-        """The most severe response per reactor, never below what is latched."""
+        """Choose the most severe response per reactor, never below what is latched."""
         response = np.array(
             [max((reason.response for reason in reasons), default=0) for reasons in found], dtype=np.int64
         )
@@ -210,7 +210,7 @@ class Interlock:
         return {key: value for part in (*self._parts, self) for key, value in memory.save(part).items()}
 
     def restore(self, state: Any) -> None:
-        """The inverse of `state`, of an interlock that has not been used.
+        """Restore the output of `state` into an interlock that has not been used.
 
         Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
@@ -238,5 +238,5 @@ class _Reason:
 
 
 def kinds_of(text: str) -> list[str]:
-    """The kinds of the reasons in a line of the interlock's."""
+    """List the kinds of the reasons in a line of the interlock's."""
     return [kind for kind, colon, _ in (part.partition(": ") for part in text.split(" | ")) if colon]

@@ -1,5 +1,4 @@
-"""What each sample says by itself: whether it came in time, whether a working sensor can have given it, whether it is
-too hot."""
+"""Checks of single samples: in time, possible for a working sensor, not too hot."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +47,7 @@ class Readings:
         self._repeats = np.zeros(n)  # samples in a row that were equal to the one before
 
     def check(self, m: Measurement, fresh: Mask, now: float) -> tuple[Mask, list[Finding]]:
-        """The fresh rows whose reading may be believed, and what is wrong with the others."""
+        """Find the fresh rows whose reading may be used, and what is wrong with the others."""
         findings = self._ages(m, fresh, now)
         od, raw = m.od, self._raw(m)
         believed, broken, impossible, frozen, repeats = self._judge(m, fresh)
@@ -61,11 +60,11 @@ class Readings:
         return believed, findings
 
     def believed(self, m: Measurement, fresh: Mask) -> Mask:
-        """The fresh rows whose reading `check` would say may be believed; changes nothing."""
+        """Find the fresh rows whose reading `check` would accept; changes nothing."""
         return self._judge(m, fresh)[0]
 
     def _raw(self, m: Measurement) -> Array:
-        """Counts; without a device there are none, and they pass."""
+        """Check counts; without a device there are none, and they pass."""
         return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
     def _judge(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Mask, Array]:
@@ -92,7 +91,7 @@ class Readings:
         return [Finding(kind, mask, lambda i: f"no new sample for {age[i]:.0f} s") for kind, mask in rows.items()]
 
     def resumed(self) -> None:
-        """The age of the newest sample begins anew.
+        """Restart the age of the newest sample.
 
         While the program was gone nobody could have seen a sample: a reactor is stale, lost or silent only once it
         had its chance.
@@ -145,7 +144,7 @@ class Heat:
         ]
 
     def _relieve(self, temperature: Array, target: Array, known: Mask, now: float) -> None:
-        """A drop of the target raises the limit by as much; that decays with the cooling time. So at a run's start."""
+        """Raise the limit by a drop of the target, also at a run's start; the rise decays with the cooling time."""
         seen = np.isfinite(self._target_c)
         minutes = np.where(known & seen, (now - self._thermo_s) / 60.0, 0.0)
         drop = np.where(known & seen, np.maximum(self._target_c - target, 0.0), 0.0)

@@ -69,7 +69,7 @@ class UnexplainedChange:
         return findings
 
     def takes(self, reading: Array, time_s: Array, believed: Mask) -> Mask:
-        """The `believed` rows from whose reading `check` would go on; arguments as there, changes nothing."""
+        """Find the `believed` rows from whose reading `check` would go on; arguments as there, changes nothing."""
         step, _, _, settled = self._steps(np.where(believed, reading, math.nan), time_s / 60.0)
         return np.asarray(believed & (~step | settled))
 
