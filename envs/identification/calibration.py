@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.identification.drift import cuts, drift, segments
+from envs.identification.drift import NOTABLE_DRIFT_PCT, cuts, drift, segments
 from envs.identification.found import Calibration, Verdict
 from envs.identification.free_run import Fit, fit
-from envs.identification.model import NotIdentifiable, check_excitation, pmse, trajectory
+from envs.identification.model import NotIdentifiable, Parameter, check_excitation, pmse, trajectory
 from envs.identification.prediction_error import enough, estimate, outliers
 from envs.identification.refusal import check_estimate
 from envs.identification.screening import Rejection, Screened, Series, noise_sd, screen
@@ -81,6 +81,9 @@ def calibrate(
     whole = estimate([inside], seed=config.seed)[0]
     try:
         check_estimate(whole, inside)
+        fitted = [s for s in along if window[0] <= s.first and s.end <= window[1]]
+        _check_between("mu", whole.mu, [s.mu for s in fitted])
+        _check_between("tau", whole.tau, [s.tau for s in fitted])
         sound = True
     except NotIdentifiable:
         sound = False
@@ -112,6 +115,20 @@ def calibrate(
     )
     verdict, warnings = judged(result, _limit(result, config), doubts)
     return replace(result, verdict=verdict, warnings=warnings)
+
+
+def _check_between(name: str, whole: Parameter | None, alone: list[Parameter | None]) -> None:
+    """Refuse an estimate that lies 10 % or more beyond the intervals of all segments. Raises: NotIdentifiable."""
+    known = [p for p in alone if p is not None]
+    if whole is None or not known:
+        return
+    low, high, margin = min(p.low for p in known), max(p.high for p in known), NOTABLE_DRIFT_PCT / 100 * whole.value
+    if not low - margin <= whole.value <= high + margin:
+        raise NotIdentifiable(
+            f"{name} = {whole.value:.4g} of the whole window, but its {len(known)} segments alone give {low:.4g} to "
+            f"{high:.4g}: the culture or the pump changed on the way",
+            "give calibrate the rows before the change",
+        )
 
 
 def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:

@@ -79,7 +79,7 @@ def check_excitation(series: Series) -> None:
     """Refuse rows in which the pump cannot have told dilution from growth.
 
     tau shows only where the pump rate changes: without any feed 1/tau multiplies zero, and with a constant one only
-    mu - u/tau can be seen.
+    mu - u/tau can be seen. The lowest and the highest two rates may be odd rows and count for nothing.
 
     Raises: NotIdentifiable.
     """
@@ -89,23 +89,16 @@ def check_excitation(series: Series) -> None:
         raise NotIdentifiable(
             f"{where}: {len(used)} usable readings; at least {MIN_READINGS} are needed", "record for longer"
         )
-    rate = series.pump_rate[used[0] : used[-1]]
-    low, high = float(rate.min()), float(rate.max())
+    rate = np.sort(series.pump_rate[used[0] : used[-1]])
+    low, high = float(rate[MIN_STEPS - 1]), float(rate[-MIN_STEPS])
     if high == 0.0:
-        raise NotIdentifiable(
-            f"{where}: the pump never runs, so nothing tells tau", "record with a pump that runs and rests"
-        )
-    middle = 0.5 * (low + high)
+        ran = f"runs in {int((rate > 0.0).sum())} rows, at least {MIN_STEPS} are needed" if rate[-1] else "never runs"
+        why = f"{where}: the pump {ran}, so nothing tells tau"
+        raise NotIdentifiable(why, "record with a pump that runs and rests")
     if high - low < 1e-3 * high:
         raise NotIdentifiable(
-            f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s), so growth and dilution cannot "
-            "be told apart"
-        )
-    on, off = int((rate > middle).sum()), int((rate <= middle).sum())
-    if min(on, off) < MIN_STEPS:
-        raise NotIdentifiable(
-            f"{where}: the pump is above {middle:g} mL/s in {on} rows and below in {off}; at least {MIN_STEPS} of each "
-            "are needed to tell dilution from growth"
+            f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s) in {MIN_STEPS} rows or "
+            "more, so growth and dilution cannot be told apart"
         )
 
 

@@ -36,6 +36,7 @@ FROZEN_ROWS = 10
 FEWEST_READINGS = 10  # that anything is estimated from
 NOISY_FACTOR = 6.0
 WEEK_MIN = 10080
+LATE_MIN = 0.3  # of a merged minute, before its last reading
 GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
 
 
@@ -109,7 +110,8 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
 def merged(series: Series) -> Series:
     """Merge rows of half a minute and less, where there are more rows than a week has minutes.
 
-    A merged row stands at the middle one of its rows, with the median of its readings; the pump's volume is kept.
+    A merged row stands at its last reading, with the median of the readings of the 18 s up to there, so that no dose
+    between two readings changes sides; the pump's volume is kept.
     """
     if len(series.time) <= WEEK_MIN:
         return series
@@ -118,14 +120,16 @@ def merged(series: Series) -> Series:
     if 2 * len(first) > len(minute):
         return series
     count = np.diff(first, append=len(minute))
-    order = np.lexsort((series.od, minute))  # nan last
-    readings = np.add.reduceat(np.isfinite(series.od), first, dtype=np.int64)
-    od = series.od[order[first + np.maximum(readings - 1, 0) // 2]]
-    middle = first + (count - 1) // 2
-    time = series.time[middle]
-    volume = pumped_volume(series.time, series.pump_rate)[middle]
-    rate = np.append(np.diff(volume) / np.diff(time), series.pump_rate[middle[-1]])
-    return Series(time, od, np.maximum(rate, 0.0), series.row[first])
+    read = np.isfinite(series.od)
+    at = np.maximum.reduceat(np.where(read, np.arange(len(minute)), -1), first)
+    at = np.where(at < 0, first + count - 1, at)
+    od = np.where(series.time > np.repeat(series.time[at], count) - LATE_MIN, series.od, np.nan)
+    order = np.lexsort((od, minute))  # nan last
+    readings = np.add.reduceat(np.isfinite(od), first, dtype=np.int64)
+    volume = pumped_volume(series.time, series.pump_rate)[at]
+    rate = np.append(np.diff(volume) / np.diff(series.time[at]), series.pump_rate[at[-1]])
+    middle = od[order[first + np.maximum(readings - 1, 0) // 2]]
+    return Series(series.time[at], middle, np.maximum(rate, 0.0), series.row[first])
 
 
 def row_spans(rows: NDArray[np.int64]) -> str:

@@ -16,10 +16,12 @@ SHORTEST_WINDOW_MIN = 60.0
 def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: float) -> tuple[Window, str]:
     """Positions [first, end) of the window with most readings, and the reason in words.
 
-    Consecutive segments of one stretch whose estimates do not drift, of a week at most.
+    Consecutive segments of one stretch whose estimates do not drift, of a week at most. Windows with a segment that
+    tells tau, and without one in which dilution stopped to act (`_failed`), come before all others.
     Raises: NotIdentifiable when there is none of an hour at least.
     """
     clean = screened.series
+    failed = _failed(clean, along)
     apart = float(np.median(np.diff(clean.time)))
     if segment_min < FEWEST_READINGS * apart:
         raise NotIdentifiable(
@@ -29,15 +31,17 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
         )
     count = np.concatenate([[0], np.cumsum(np.isfinite(clean.od))])
     best: Window | None = None
+    most = (False, 0)
     for first, end in screened.stretches:
         inside = tuple(s for s in along if first <= s.first and s.end <= end)
         for i in range(len(inside)):
             for j in range(len(inside), i, -1):
-                a, b = inside[i].first, inside[j - 1].end
-                longer = best is None or count[b] - count[a] > count[best[1]] - count[best[0]]
+                part, a, b = inside[i:j], inside[i].first, inside[j - 1].end
                 lasts = SHORTEST_WINDOW_MIN <= _minutes(clean, a, b) <= WEEK_MIN
-                if longer and lasts and not drifts(inside[i:j]):
-                    best = (a, b)
+                tells = any(s.tau is not None for s in part) and not any(s in failed for s in part)
+                size = tells, int(count[b] - count[a])
+                if lasts and size > most and not drifts(part):
+                    best, most = (a, b), size
     if best is None:
         a, b = longest(screened)
         raise NotIdentifiable(
@@ -50,6 +54,17 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
     follows = [s for s in along if s.first == best[1]]
     capped = any(_minutes(clean, best[0], s.end) > WEEK_MIN for s in follows)
     return best, "the longest stretch without drift" + (", of a week at most" if capped else "")
+
+
+def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
+    """Find segments that pumped as much as half of all and tell no tau, where most that pumped so much do tell it.
+
+    So does a feed that fails, or a culture that collapses: their pump rate is recorded and dilutes nothing.
+    """
+    pumped = [float(clean.pump_rate[s.first : s.end].mean()) for s in along]
+    busy = [s for s, rate in zip(along, pumped, strict=True) if rate >= np.median(pumped) and rate > 0.0]
+    silent = [s for s in busy if s.tau is None]
+    return silent if 2 * len(silent) < len(busy) else []
 
 
 def longest(screened: Screened) -> Window:

@@ -168,7 +168,7 @@ def test_intervals_are_as_wide_as_the_estimates_scatter() -> None:
     [
         (lambda t: 0.0 * t, "pump never runs"),
         (lambda t: 0.0 * t + 0.01, "pump never stops"),
-        (lambda t: np.where((t > 50) & (t < 52), 0.02, 0.0), "at least 3 of each"),
+        (lambda t: np.where((t > 50) & (t < 52), 0.02, 0.0), "pump runs in 1 rows"),
     ],
 )
 def test_recording_that_cannot_give_tau_says_so(rate: object, message: str) -> None:

@@ -95,18 +95,21 @@ def test_rows_as_text(rows: list[int], text: str) -> None:
 
 
 @pytest.mark.parametrize(("per_minute", "lost"), [(3, 0.0), (3, 0.4), (5, 0.3), (8, 0.9)])
-def test_a_merged_minute_holds_the_median_of_the_readings_it_has(per_minute: int, lost: float) -> None:
+def test_a_merged_minute_holds_the_median_of_its_last_readings(per_minute: int, lost: float) -> None:
     """Of an even number the lower one of the two; no reading where there is none; volume and times are kept."""
     rng, n = np.random.default_rng(per_minute), 2 * WEEK_MIN - 1
     od = np.where(rng.random(n) < lost, np.nan, rng.uniform(0.1, 1.0, n))
     rate = rng.choice([0.0, 0.01, 0.02], n)
     found = merged(Series(90.0 + np.arange(n) / per_minute, od, rate, 11 + np.arange(n)))
     minutes = [slice(k, k + per_minute) for k in range(0, n, per_minute)]
+    at = []
     for i, of_minute in enumerate(minutes):
-        known = sorted(od[of_minute][np.isfinite(od[of_minute])])
-        np.testing.assert_equal(found.od[i], known[(len(known) - 1) // 2] if known else np.nan)
         held = range(n)[of_minute]
-        assert (found.row[i], found.time[i]) == (11 + held[0], 90.0 + held[(len(held) - 1) // 2] / per_minute)
-    first, last = ((range(n)[m][0] + range(n)[m][-1]) // 2 for m in (minutes[0], minutes[-1]))
+        read = [k for k in held if np.isfinite(od[k])]
+        at.append(read[-1] if read else held[-1])
+        known = sorted(od[k] for k in read if (at[-1] - k) / per_minute < 0.3)
+        np.testing.assert_equal(found.od[i], known[(len(known) - 1) // 2] if known else np.nan)
+        assert (found.row[i], found.time[i]) == (11 + held[0], 90.0 + at[-1] / per_minute)
+    first, last = at[0], at[-1]
     moved = np.sum(found.pump_rate[:-1] * np.diff(found.time))
     assert moved == pytest.approx(rate[first:last].sum() / per_minute)
