@@ -9,7 +9,7 @@ from hypothesis import settings
 
 from tests.programs import spent_s
 
-settings.register_profile("busy", deadline=None)  # a machine may be busy with other things; the mutants have their own
+settings.register_profile("busy", deadline=None)  # a machine may be busy with other things
 settings.load_profile("busy")
 
 for _number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
