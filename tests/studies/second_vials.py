@@ -9,8 +9,8 @@ OD and counts are the units of e, p and of the pigment f; rates are per hour, do
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from experiments.laws.share.base import Array, Law, ShareEstimator, Wanted
 
 DAY = 1440  # minutes
 VOLUME = 20.0  # mL, constant: what comes in pushes as much out
-DOSE_MAX = 1.2  # mL in a minute
+DOSE_ML = 1.2  # of a minute in which the turbidostat doses
+DOSE_UP, DOSE_DOWN = 0.53, 0.46  # OD above which it begins, and below which it ends
 PUMP_ML_S = 1.0  # flow of the pump while it turns
 START_OD = 0.5
 HEATER = 2.0  # degC/min at full power, before the loss to the air
@@ -29,10 +30,12 @@ PIGMENT = (44.49572512791427, 31.820479677943325, -917.5864128224449, -886.68547
 PIGMENT_FLOOR, PIGMENT_PER_H, PIGMENT_DELAY_MIN = 20.0, 1.6, 30
 GLOW = 150.0  # counts per OD of cells, whatever their species
 OD_SD, OD_RELATIVE_SD, LIGHT_SD, THERMOMETER_SD = 0.005, 0.01, 30.0, 0.05
+STEP_S, STEPS = 5.0, 12  # of a minute
+BAND_C = 0.5  # of the thermostat, proportional
+PREVIEW_MIN = 360.0  # before which a change of the setpoint is announced
 FACTOR_SD, OFFSET_SD = 0.02, 5.0  # of a calibration: relative, counts
 SWAP = np.array([[0.9], [1.1]])  # growth of e and p in the next bottle, relative
 
-Density = Literal["dither", "hold"]
 Value = Array | float
 
 
@@ -95,22 +98,19 @@ def draw(n: int, seed: int, **fixed: Any) -> Conditions:
 class Vials:
     """The true state: temperature (n,), rates and cells of both species (2, n), pigment f and production g (n,)."""
 
-    def __init__(self, conditions: Conditions, *, step_s: float = 5.0, band_c: float = 0.5) -> None:
-        """Start all in balance at the first temperature. band_c: proportional band of the thermostat; 0: on or off."""
-        self.steps = round(60 / step_s)
-        if abs(self.steps * step_s - 60) > 1e-9:
-            raise ValueError(f"step_s must divide a minute, not {step_s}")
+    def __init__(self, conditions: Conditions) -> None:
+        """Start all in balance at the first temperature."""
         c = self.c = conditions
-        self.step_s, self.gain, self.minute = step_s, 1 / band_c if band_c > 0 else 1e9, 0
-        self.cool: Array = np.exp(-step_s / 60 / c.cooling_min)
-        self.memory: Array = np.exp(-step_s / 60 / LAG_MIN)
+        self.minute = 0
+        self.cool: Array = np.exp(-STEP_S / 60 / c.cooling_min)
+        self.memory: Array = np.exp(-STEP_S / 60 / LAG_MIN)
         self.scale: Array = np.stack([np.asarray(c.scale_e), np.asarray(c.scale_p)])
         self.temperature: Array = np.array(c.start_c)
         self.rate = self.curve(self.temperature)
         self.cells: Array = START_OD * np.stack([1 - c.start_share, np.asarray(c.start_share)])
         self.production = production_steady(self.temperature)
         self.pigment: Array = self.production * self.cells[1] * START_OD / (self.rate * self.cells).sum(0)  # g p / D
-        self.past = np.tile(self.production, (PIGMENT_DELAY_MIN * self.steps, 1))  # ring: slot k holds step k - length
+        self.past = np.tile(self.production, (PIGMENT_DELAY_MIN * STEPS, 1))  # ring: slot k holds step k - length
         self.slot = 0
         self.light: Array = np.array(c.light)
 
@@ -136,19 +136,19 @@ class Vials:
     def pass_minute(self, target: Array, dose: Array, noise: Array) -> None:
         """One minute with a thermostat target and a true dose, pumped in a pulse from its first second on.
 
-        noise (steps + 1, n), standard normal: of the thermostat's looks and of the light.
+        noise (STEPS + 1, n), standard normal: of the thermostat's looks and of the light.
         """
-        c, hours, half = self.c, self.step_s / 3600, self.step_s / 7200
+        c, hours, half = self.c, STEP_S / 3600, STEP_S / 7200
         left, heat = dose.copy(), HEATER * c.cooling_min
         if np.any(swapped := self.minute >= 60 * c.bottle_swap):
             self.scale = np.stack([np.asarray(c.scale_e), np.asarray(c.scale_p)]) * np.where(swapped, SWAP, 1.0)
         seen_from = target - c.offset_c
-        for k in range(self.steps):
+        for k in range(STEPS):
             if left.any():
-                pumped = np.minimum(left, PUMP_ML_S * self.step_s)
+                pumped = np.minimum(left, PUMP_ML_S * STEP_S)
                 keep = np.exp(-pumped / VOLUME)
                 left, self.cells, self.pigment = left - pumped, self.cells * keep, self.pigment * keep
-            power = (seen_from - THERMOMETER_SD * noise[k] - self.temperature) * self.gain
+            power = (seen_from - THERMOMETER_SD * noise[k] - self.temperature) / BAND_C
             settled = c.ambient_c + heat * np.minimum(np.maximum(power, 0.0), 1.0)
             temperature = settled + (self.temperature - settled) * self.cool
             middle = 0.5 * (self.temperature + temperature)
@@ -163,7 +163,7 @@ class Vials:
             self.past[self.slot] = self.production
             self.slot, self.temperature, self.rate = following, temperature, rate
             self.cells, self.production = cells, production
-        self.light = self.light * np.exp(c.light_walk / np.sqrt(DAY) * noise[self.steps])
+        self.light = self.light * np.exp(c.light_walk / np.sqrt(DAY) * noise[STEPS])
         self.minute += 1
 
 
@@ -174,54 +174,21 @@ def production_steady(temperature: Array) -> Array:
     return np.maximum(value, PIGMENT_FLOOR)
 
 
-@dataclass
-class Turbidostat:
-    """The rig's own law of the density: told doses from OD readings, mL, (n,).
-
-    dither: DOSE_MAX every minute from .53 down to .46. hold: 20 mL (.9/h + .2/min ln(OD / .5)), within the bounds.
-    """
-
-    n: int
-    density: Density = "dither"
-    low: float = 0.46
-    high: float = 0.53
-    setpoint: float = START_OD
-    on: Any = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Refuse names that do not exist."""
-        if self.density not in ("dither", "hold"):
-            raise ValueError(f"density must be dither or hold, not {self.density}")
-        self.on = np.zeros(self.n, dtype=np.bool_)
-
-    def dose(self, od: Array) -> Array:
-        """Decide for the minute after a reading."""
-        if self.density == "hold":
-            error = np.log(np.maximum(od, 1e-3) / self.setpoint)
-            return np.clip(VOLUME * (0.9 / 60 + 0.2 * error), 0.0, DOSE_MAX)
-        self.on = (od > self.high) | (self.on & (od > self.low))
-        return np.where(self.on, DOSE_MAX, 0.0)
-
-
 @dataclass(frozen=True)
 class Program:
-    """Steps (minutes, share). After the last one all are repeated, or it stays in force."""
+    """Steps (minutes, share), all of which are repeated after the last one."""
 
     steps: tuple[tuple[float, float], ...]
-    repeats: bool = True
-    preview_min: float = 360.0
 
     def ahead(self, minute: float) -> tuple[float, float, float]:
         """Return the share in force, the announced one and the minutes until it."""
         length, count = sum(step[0] for step in self.steps), len(self.steps)
-        if not self.repeats and minute >= length:
-            return self.steps[-1][1], self.steps[-1][1], 0.0
         left, now = minute % length, 0
         while left >= self.steps[now][0]:
             left, now = left - self.steps[now][0], now + 1
         share, until = self.steps[now][1], self.steps[now][0] - left
-        for step in range(now + 1, now + count if self.repeats else count):
-            if until > self.preview_min:
+        for step in range(now + 1, now + count):
+            if until > PREVIEW_MIN:
                 break
             minutes, following = self.steps[step % count]
             if following != share:
@@ -269,11 +236,8 @@ def run(
     hours: float,
     *,
     seed: int = 0,
-    density: Density = "dither",
     samples: Sequence[float] = (),
     sample_sd: float = 0.03,
-    step_s: float = 5.0,
-    band_c: float = 0.5,
 ) -> Trace:
     """Run all vials. The same seed gives the same luck, minute by minute, whatever estimator and law do.
 
@@ -281,7 +245,7 @@ def run(
     """
     c, n = conditions, conditions.n
     rng, offline = np.random.default_rng(seed).spawn(2)
-    vials, turbidostat = Vials(c, step_s=step_s, band_c=band_c), Turbidostat(n, density)
+    vials, on = Vials(c), np.zeros(n, dtype=np.bool_)
     rows, minutes = np.ones(n, dtype=np.bool_), round(60 * hours)
     sampled = {round(60 * hour) for hour in samples}
     trace = {name: np.empty((minutes, n)) for name in Trace.__dataclass_fields__}
@@ -292,7 +256,7 @@ def run(
         told_bias: Array = c.bias + OFFSET_SD * np.asarray(c.bias_error)
         estimator.calibrate(factor, FACTOR_SD * factor, told_bias, OFFSET_SD)  # type: ignore[attr-defined]
     for row in range(minutes):
-        minute, noise = np.full(n, float(row)), rng.standard_normal((vials.steps + 5, n))
+        minute, noise = np.full(n, float(row)), rng.standard_normal((STEPS + 5, n))
         od, counts, thermometer = vials.read(noise[:3])
         estimator.watch(od, counts, thermometer, minute, rows)
         if row in sampled and (sample := getattr(estimator, "sample", None)) is not None:
@@ -300,7 +264,8 @@ def run(
             sample(seen, np.full(n, sample_sd), float(row), rows)
         wanted, belief = program.wanted(row, n), estimator.explain()
         target = law.act(estimator.estimate(), wanted, minute, rows)
-        told = turbidostat.dose(od)
+        on = (od > DOSE_UP) | (on & (od > DOSE_DOWN))
+        told = np.where(on, DOSE_ML, 0.0)
         true = told * c.flow * np.maximum(0.0, 1 + c.dose_spread * noise[3])
         now = Trace(
             share=vials.share,
@@ -331,11 +296,6 @@ def _daily(values: Array) -> Array:
 def coverage(trace: Trace) -> Array:
     """Share of the minutes in which the band holds the true share, (days, n); .mean(1) is that of all vials."""
     return _daily(((trace.low <= trace.share) & (trace.share <= trace.high)).astype(np.float64))
-
-
-def tracking_error(trace: Trace) -> Array:
-    """Mean |true share - setpoint|, (days, n)."""
-    return _daily(np.abs(trace.share - trace.setpoint))
 
 
 def estimate_error(trace: Trace) -> Array:

@@ -12,12 +12,9 @@ QUIET = Conditions(hours=2, wander=0, dose_spread=0, noise=0)
 NEVER, ALWAYS = 1e9, 1e-9  # setpoints at which a threshold never or always pumps
 
 
-@pytest.mark.parametrize("pulse", [True, False])
-@pytest.mark.parametrize("period", [0.5, 1.0, 2.5, 15.0])
-def test_constant_rates_give_an_exponential(pulse: bool, period: float) -> None:
-    conditions = replace(QUIET, law="threshold", pulse=pulse, period_min=period)
+def test_constant_rates_give_an_exponential() -> None:
     for setpoint, net in ((NEVER, 0.03), (ALWAYS, 0.03 - 0.02 * 3)):
-        made = simulate(replace(conditions, setpoint=setpoint), 2, 0)
+        made = simulate(replace(QUIET, law="threshold", setpoint=setpoint), 2, 0)
         np.testing.assert_allclose(made.od[0], 0.5 * np.exp(net * made.time), rtol=1e-11)
         np.testing.assert_allclose(made.growth, 0.03, rtol=1e-12)
 
@@ -35,44 +32,20 @@ def test_wander_has_its_sd_and_memory() -> None:
         assert correlation == pytest.approx(np.exp(-lag / memory), abs=0.05)
 
 
-@pytest.mark.parametrize("law", ["normal", "gamma"])
-def test_doses_spread(law: str) -> None:
-    made = simulate(replace(QUIET, law="threshold", dose_spread=0.2, dose_law=law, hours=6), 50, 2)
+def test_doses_spread_readings_are_noisy_and_a_share_of_a_dose_is_late() -> None:
+    made = simulate(replace(QUIET, law="threshold", dose_spread=0.2, hours=6), 50, 2)
     on = made.pump_rate[:, :-1] > 0
     factor = (0.03 - np.diff(np.log(made.od))[on]) / (0.02 * 3)
-    assert factor.mean() == pytest.approx(1, abs=0.01)
-    assert factor.std() == pytest.approx(0.2, rel=0.05)
-    skew = np.mean((factor - 1) ** 3) / 0.2**3
-    assert skew == pytest.approx(0.4 if law == "gamma" else 0, abs=0.15)  # 2 / sqrt(shape) of a gamma
-
-
-def test_reading_noise_is_correlated_and_outliers_are_counted() -> None:
-    still = replace(QUIET, law="threshold", mu=0, setpoint=NEVER, hours=12, blank=0.02)
-    ratio = (simulate(replace(still, noise=0.01, noise_correlation=0.4), 50, 3).od - 0.02) / 0.5 - 1
+    assert (factor.mean(), factor.std()) == (pytest.approx(1, abs=0.01), pytest.approx(0.2, rel=0.05))
+    still = replace(QUIET, law="threshold", mu=0, setpoint=NEVER, hours=12)
+    ratio = simulate(replace(still, noise=0.01, noise_correlation=0.4), 50, 3).od / 0.5 - 1
     assert ratio.std() == pytest.approx(0.01, rel=0.03)
     assert np.mean(ratio[:, 1:] * ratio[:, :-1]) / ratio.var() == pytest.approx(0.4, abs=0.03)
-    off = np.abs((simulate(replace(still, outlier_share=0.02), 50, 3).od - 0.02) / 0.5 - 1)
-    assert np.mean(off > 0.09) == pytest.approx(0.02, rel=0.2)
-    assert off[off > 0.09].min() >= 0.1 - 1e-9
-    assert off.max() <= 0.5 + 1e-9
-
-
-def test_stirring_and_late_share_delay_a_dose() -> None:
-    one = replace(QUIET, law="threshold", mu=0, setpoint=0.49, hours=0.1)
-    after = 0.5 * np.exp(-0.06)
-    lagged = simulate(replace(one, stirring_min=1.0, step_min=0.01), 1, 0)
-    assert lagged.pump_rate[0].tolist() == [0.02, 0, 0, 0, 0, 0, 0]
-    # the pulse lasts 1.2 s, so that its middle is .01 min after the row
-    np.testing.assert_allclose(lagged.od[0, 1:], after + (0.5 - after) * np.exp(-(lagged.time[1:] - 0.01)), rtol=1e-5)
-    coarse = simulate(replace(one, stirring_min=1.0), 1, 0)
-    np.testing.assert_allclose(coarse.od, lagged.od, rtol=1e-3)
-    late = simulate(replace(one, late_share=0.25), 1, 0)
+    late = simulate(replace(QUIET, law="threshold", mu=0, setpoint=0.49, hours=0.1, late_share=0.25), 1, 0)
     np.testing.assert_allclose(late.od[0, :3], 0.5 * np.exp([0, -0.045, -0.06]), rtol=1e-12)
-    grown = simulate(replace(QUIET, law="threshold", setpoint=NEVER, stirring_min=0.5), 1, 0)
-    np.testing.assert_allclose(grown.od[0], 0.5 * np.exp(0.03 * grown.time) / (1 + 0.03 * 0.5), rtol=1e-4)
 
 
-@pytest.mark.parametrize("law", ["pi", "tuned_pi", "smooth_pi", "threshold", "relay", "proportional"])
+@pytest.mark.parametrize("law", ["pi", "tuned_pi", "threshold", "proportional"])
 def test_laws_hold_the_setpoint_at_the_balance(law: str) -> None:
     made = simulate(Conditions(law=law, hours=12), 30, 4)
     held = made.od[:, 240:]
@@ -99,13 +72,11 @@ def test_device_pi_is_the_documented_one() -> None:
 
 
 @pytest.mark.parametrize("law", sorted(LAWS))
-def test_every_law_is_bounded_rests_and_repeats(law: str) -> None:
-    conditions = Conditions(law=law, hours=10, rest_min=10, outlier_share=0.005)
+def test_every_law_is_bounded_and_repeats(law: str) -> None:
+    conditions = Conditions(law=law, hours=10)
     made, again = simulate(conditions, 5, 6), simulate(conditions, 5, 6)
     np.testing.assert_array_equal(made.od, again.od)
     assert made.od.shape == made.pump_rate.shape == (5, 601)
     assert made.pump_rate.min() >= 0
     assert made.pump_rate.max() <= 0.02
-    assert not made.pump_rate[:, made.time % 60 >= 50].any()
-    # a random walk beyond the bounds comes back: 1.2 plus the growth of a rest and an outlier
-    assert 0.08 * 0.4 < made.od.min() <= made.od.max() < 1.2 * 1.6 * np.exp(0.4)
+    assert 0.08 * 0.4 < made.od.min() <= made.od.max() < 1.2 * np.exp(0.4)  # a random walk beyond the bounds comes back
