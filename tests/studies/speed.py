@@ -7,14 +7,11 @@ else the machine does meets both; what is reported is the median of each and the
 import logging
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
@@ -36,16 +33,13 @@ log = logging.getLogger(__name__)
 class SpeedConfig:
     """What to time."""
 
-    groups: tuple[str, ...] = setting(
-        ("training", "update", "environment", "start_up", "controllers", "mpc"), "which measurements"
-    )
+    groups: tuple[str, ...] = setting(("training", "environment", "controllers", "mpc"), "which measurements")
     runs: int = setting(
         5,
         "pairs per measurement, after one that is thrown away",
         within=(5, 1000),
         note="a median of fewer says little",
     )
-    scaling: bool = setting(True, "also the figure of cost over population, batch, copies and episodes")
 
     def __post_init__(self) -> None:
         check(self)
@@ -56,9 +50,7 @@ class SpeedConfig:
 
 GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
     "training": learning.training,
-    "update": learning.update,
     "environment": learning.environment,
-    "start_up": learning.start_up,
     "controllers": control.loops,
     "mpc": control.mpc,
 }
@@ -67,7 +59,7 @@ GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
 
 def speed(config: SpeedConfig, folder: Path) -> None:
     """Measure every group; summary.json, a table in tables/ and on the screen, a report."""
-    from experiments.reporting import charts, page
+    from experiments.reporting import page
 
     found = []
     with logging_redirect_tqdm():
@@ -75,33 +67,10 @@ def speed(config: SpeedConfig, folder: Path) -> None:
             found.append(measure(m, config.runs))
             log.info("%s: %.4g %s; %s: %.4g; ratio %.3g", m.name, found[-1]["ours"], m.unit, m.rival,
                      found[-1]["theirs"], found[-1]["ratio"])  # fmt: skip
-    if config.scaling:
-        log.info("scaling of updates, environment and training")
-        charts.save(drawn(learning.scaling(config.runs)), folder / "figures", "scaling")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     files.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
     tables.write([table(found, config.runs, machine)], folder / "tables")
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
-
-
-def drawn(costs: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Figure:
-    """Cost over one size at a time, with the line of proportional growth through the largest.
-
-    Args: costs: title -> (sizes (K,), seconds (K,)).
-    """
-    from experiments.reporting import charts
-
-    figure, axes = charts.new_figure(10.0, 2.9, 1, len(costs))
-    for ax, (title, (sizes, seconds)) in zip(axes, costs.items(), strict=True):
-        ax.loglog(sizes, seconds, marker="o", markersize=3.5, color=charts.COLOURS[0], linewidth=1.2, label="measured")
-        ax.loglog(
-            sizes, seconds[-1] * sizes / sizes[-1], color="black", linewidth=0.8, linestyle=":", label="proportional"
-        )
-        ax.set_title(title, fontsize=9)
-        ax.set_xlabel(title.split(",")[0])
-    axes[0].set_ylabel("time, s")
-    axes[0].legend()
-    return figure
 
 
 def table(found: list[dict[str, Any]], runs: int, machine: str) -> Table:
