@@ -1,4 +1,4 @@
-"""A deployment on the rig judged by its truth, beside the vendor's turbidostat: `python -m tests.campaigns.rig_study`.
+"""A deployment on the rig judged by the truth of its vials: `python -m tests.campaigns.rig_study`.
 
 The conf file says what is written.
 """
@@ -13,79 +13,91 @@ from typing import Any
 
 import numpy as np
 
+from conf.schema import check, part, setting
 from experiments.cli import files, frame
 from experiments.reporting.tables import markdown, number
-from hardware.errors import ReactorError, RecordingError
+from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 from tests.campaigns import rig_truth
-from tests.campaigns.rig_run import LOOK_S, RigStudyConfig, run_on_rig
-from tests.campaigns.rig_truth import Span, UnitTruth
+from tests.campaigns.client import Client
+from tests.campaigns.rig_truth import Limits, UnitTruth
 from tests.entry import command
 
-__all__ = ["rig_study"]
+__all__ = ["RigStudyConfig", "rig_study"]
 
 log = logging.getLogger(__name__)
 
-BESIDE = ("dosing_events.jsonl", "vendor.jsonl")  # which only this command's own runs have
+
+@dataclass(frozen=True)
+class RigStudyConfig:
+    """What is run and what it has to keep. Raises: ValueError naming key, value and allowed range."""
+
+    run: str = setting("", "folder of a run of backend=pioreactor_rig, which is judged; empty: run one")
+    speed: float = setting(
+        4.0, "growth faster than real time: device seconds per real second", within=(1, 60), note="10 on idle cores"
+    )
+    overrides: tuple[str, ...] = setting(
+        ("scenario.recovery_od=0.7", "bench.volumes_ml.pio02=14"), "further words of the deploy command"
+    )
+    limits: Limits = part(Limits, "what the deployment has to keep")
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A run on the rig, as its folder has it; events: None where none were recorded."""
+    """A run on the rig, as its folder has it."""
 
-    reactors: tuple[str, ...]
     speed: float
     volume_ml: Mapping[str, float]
     journal: Sequence[Mapping[str, Any]]
     truth: Sequence[Mapping[str, Any]]
-    events: Sequence[Mapping[str, Any]] | None
-    vendor: Sequence[Mapping[str, Any]]
-
-    @property
-    def spans(self) -> dict[str, list[Span]]:
-        """The windows of each unit; the vendor's last."""
-        found = {unit: rig_truth.phases(self.journal, unit) for unit in self.reactors}
-        return found | {str(row["unit"]): rig_truth.targets(self.vendor) for row in self.vendor[:1]}
 
 
 def recorded(folder: Path) -> Recorded:
-    """The run in a folder, or in `run` of the folder of this command. Raises: UserError naming what it lacks."""
-    folder = folder / "run" if (folder / "run" / "journal.jsonl").is_file() else folder
+    """The run in a folder. Raises: UserError naming what it lacks."""
     try:
         config: Any = files.load_yaml(folder / "config.yaml")
         reactors, speed, bench = tuple(config.backend.reactors), float(config.backend.speed), config.bench
         volume = {u: float(bench.volumes_ml.get(u, bench.volume_ml)) for u in reactors}
         journal, _ = read_journal(folder / "journal.jsonl")
-        truth = _rows(folder / "truth.jsonl")
-        events, vendor = (_rows(path) if (path := folder / name).exists() else None for name in BESIDE)
+        lines = (folder / "truth.jsonl").read_text(encoding="utf-8").split("\n")[:-1]
+        return Recorded(speed, volume, journal, [json.loads(line) for line in lines])
     except (OSError, ValueError, TypeError, AttributeError, RecordingError) as error:
         remedy = "give the folder of a run of backend=pioreactor_rig, which has config.yaml, journal.jsonl, truth.jsonl"
         raise frame.UserError(f"run={folder}: {error}; {remedy}") from None
-    return Recorded(reactors, speed, volume, journal, truth, events, vendor or [])
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
-    """JSON lines; what follows the last line end is left out. Raises: OSError, ValueError."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
+def deployed(config: RigStudyConfig, folder: Path) -> Path:
+    """Deploy on a rig until the schedule's end; returns the folder. Raises: UserError."""
+    said = folder / "deployment.log"
+    words = ["backend=pioreactor_rig", f"backend.speed={config.speed}", "scenario=setpoint_steps", *config.overrides]
+    client = Client([*words, f"hydra.run.dir={folder / 'run'}"], said)
+    try:
+        while client.status is None:
+            time.sleep(0.2)
+    finally:
+        client.end(60.0)
+    if client.status:
+        last = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:] or ["no word"]
+        raise frame.UserError(f"the deployment ended with status {client.status}: {last[0]}; {said} has all")
+    return folder / "run"
 
 
 def found_in(run: Recorded) -> list[UnitTruth]:
-    """Every unit, the judged ones first."""
+    """Every unit."""
     found = []
-    for unit, spans in run.spans.items():
+    for unit in run.volume_ml:
+        spans = rig_truth.phases(run.journal, unit)
         windows = tuple(rig_truth.held(span, run.truth, unit, run.speed) for span in spans)
-        judged = unit in run.reactors
-        doses = rig_truth.account(run.journal, run.truth, run.events, unit) if judged else None
+        doses = rig_truth.account(run.journal, run.truth, unit)
         found.append(UnitTruth(unit, windows, rig_truth.vial(run.truth, unit), doses))
     return found
 
 
 def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
     """table.md: how the setpoints were held, and what became of the doses."""
-    look = LOOK_S * run.speed / 60.0
-    lines = [f"Growth {run.speed:g} times faster than real time.", ""]
-    if run.vendor:
-        lines[0] += f" The vendor's turbidostat looks every {LOOK_S:g} s of real time: {look:g} min of the culture."
     last = f"last {rig_truth.LAST_MIN:.0f} min"
     head = ("unit", "setpoint", "mean error", f"mean error, {last}", f"bias, {last}", "media, mL")
     rows = [
@@ -93,44 +105,40 @@ def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
          f"{h.media_ml:.2f}") for u in found for h in u.held
     ]  # fmt: skip
     doses = ("unit", "doses", "runs of the pump", "error, mL: mean", "largest", "outside of the bound, mL",
-             "cut short", "without intent", "twice", "missing", "ids told", "given, mL", "booked, mL", "difference",
+             "cut short", "without intent", "twice", "missing", "given, mL", "booked, mL", "difference",
              "volume, mL: peak", "end")  # fmt: skip
-    return "\n".join([*lines, markdown(head, rows), markdown(doses, map(_dose_row, found))])
+    said = [f"Growth {run.speed:g} times faster than real time.", ""]
+    return "\n".join([*said, markdown(head, rows), markdown(doses, map(_dose_row, found))])
 
 
 def _dose_row(u: UnitTruth) -> tuple[str, ...]:
-    volumes, a = (f"{u.vial.peak_ml:.2f}", f"{u.vial.end_ml:.2f}"), u.account
-    if a is None:
-        return u.unit, "–", str(u.vial.doses), *["–"] * 8, f"{u.vial.media_ml:.2f}", "–", "–", *volumes
-    told = "not recorded" if a.ids_untold is None else f"{a.asked - a.missing - a.ids_untold} of {a.asked - a.missing}"
+    a = u.account
     return (
         u.unit, str(a.asked), str(a.runs), f"{a.error_mean_ml:+.4f}", f"{a.error_max_ml:.4f}", number(a.outside_ml, 2),
-        str(a.cut), str(a.without_intent), str(a.twice), str(a.missing), told,
-        f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}", f"{a.total_pct:+.2f} %", *volumes,
+        str(a.cut), str(a.without_intent), str(a.twice), str(a.missing), f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}",
+        f"{a.total_pct:+.2f} %", f"{u.vial.peak_ml:.2f}", f"{u.vial.end_ml:.2f}",
     )  # fmt: skip
 
 
-def draw(run: Recorded, folder: Path) -> None:
+def draw(run: Recorded, found: Sequence[UnitTruth], folder: Path) -> None:
     """True OD of every unit over setpoint, above the doses that its media pump gave."""
     from experiments.reporting.charts import COLOURS, new_figure, save
 
-    spans = run.spans
-    zero = min((span.start for each in spans.values() for span in each), default=0.0)
+    spans = rig_truth.phases(run.journal, found[0].unit)
+    zero = min((span.start for span in spans), default=0.0)
     figure, (top, bottom) = new_figure(8.0, 4.8, 2, 1, sharex=True, height_ratios=[2.2, 1.0])
-    for k, (unit, mine) in enumerate(spans.items()):
-        seen = [(row["wall"], row["od"]) for row in rig_truth.of_unit(run.truth, unit) if "od" in row]
+    for k, u in enumerate(found):
+        seen = [(row["wall"], row["od"]) for row in rig_truth.of_unit(run.truth, u.unit) if "od" in row]
         wall, od = np.array(seen).reshape(-1, 2).T
-        starts, volumes = rig_truth.media_runs(run.truth, unit)
-        label = unit if unit in run.reactors else f"{unit}: the vendor's turbidostat"
-        top.plot((wall - zero) * run.speed / 60.0, od, color=COLOURS[k], linewidth=1.1, label=label, zorder=3 - k)
+        starts, volumes = rig_truth.media_runs(run.truth, u.unit)
+        top.plot((wall - zero) * run.speed / 60.0, od, color=COLOURS[k], linewidth=1.1, label=u.unit)
         bottom.plot((starts - zero) * run.speed / 60.0, volumes, ".", color=COLOURS[k], markersize=4.5)
-        for n, span in enumerate(mine if k == 0 else []):
-            edges = [(at - zero) * run.speed / 60.0 for at in (span.start, span.end)]
-            style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
-            top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
-    held = [row["od"] for unit in run.reactors for row in rig_truth.of_unit(run.truth, unit) if "od" in row]
-    top.set(ylabel="true OD", ylim=(0.0, 1.3 * max(held, default=1.0)))  # a vendor's unit that escapes leaves the axes
-    top.legend(handles=sorted(top.get_legend_handles_labels()[0], key=lambda line: line.get_label() == "setpoint"))
+    for n, span in enumerate(spans):
+        edges = [(at - zero) * run.speed / 60.0 for at in (span.start, span.end)]
+        style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
+        top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
+    top.set(ylabel="true OD", ylim=(0.0, None))
+    top.legend()
     bottom.set(ylabel="dose, mL", xlabel="time, min of the culture", ylim=(0.0, None))
     save(figure, folder / "figures", "rig_study")
 
@@ -138,17 +146,14 @@ def draw(run: Recorded, folder: Path) -> None:
 def rig_study(config: RigStudyConfig, folder: Path) -> None:
     """Run, or take a run that is there; table, figure, summary.json. Raises: UserError where a limit is not met."""
     began = time.monotonic()
-    try:
-        run = recorded(Path(config.run) if config.run else run_on_rig(config, folder))
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None
+    run = recorded(Path(config.run) if config.run else deployed(config, folder))
     found = found_in(run)
-    wrong = [line for u in found if u.account for line in rig_truth.trouble(u, config.limits, run.volume_ml[u.unit])]
+    wrong = [line for u in found for line in rig_truth.trouble(u, config.limits, run.volume_ml[u.unit])]
     units = {u.unit: {key: value for key, value in asdict(u).items() if key != "unit"} for u in found}
-    summary = {"met": not wrong, "speed": run.speed, "vendor_look_min": LOOK_S * run.speed / 60.0, "not_met": wrong}
+    summary = {"met": not wrong, "speed": run.speed, "not_met": wrong}
     files.write_json(folder / "summary.json", {**summary, "units": units, "wall_s": round(time.monotonic() - began, 1)})
     (folder / "table.md").write_text(table(run, found), encoding="utf-8")
-    draw(run, folder)
+    draw(run, found, folder)
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "rig_study.png")
     if wrong:
         raise frame.UserError(f"not met: {'; '.join(wrong)}")

@@ -1,13 +1,12 @@
 """A deployment on the Pioreactor rig judged by its truth: rows in, findings out; no clocks, no sockets, no files.
 
-The rows are those of `journal.jsonl` and `truth.jsonl` of a run, of the vendor's `dosing_events`, and of the targets
-that the vendor's own turbidostat was given. Times are wall times, s since 1970, of one computer.
+The rows are those of `journal.jsonl` and `truth.jsonl` of a run. Times are wall times, s since 1970, of one computer.
 """
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 from conf.schema import check, setting
 
 __all__ = [
-    "Account", "Dose", "Held", "Limits", "Span", "UnitTruth", "Vial", "account", "asked", "held", "phases", "targets",
-    "trouble", "vial",
+    "Account", "Dose", "Held", "Limits", "Span", "UnitTruth", "Vial", "account", "asked", "held", "phases", "trouble",
+    "vial",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -99,8 +98,6 @@ class Account:
     error_mean_ml, error_max_ml: mean of given minus asked and its largest size, without those. outside_ml: largest
     distance of what was given from the driver's bound, with those. given_ml, booked_ml: sums by the truth and by the
     journal; total_pct: how much more was given, % of what was given. ids_repeated: ids of more than one dose.
-    ids_untold: given doses whose id is in none of the vendor's dosing events, None where those were not recorded;
-    foreign_events: dosing events with an id of no dose, None likewise.
     """
 
     asked: int
@@ -116,8 +113,6 @@ class Account:
     booked_ml: float
     total_pct: float
     ids_repeated: int
-    ids_untold: int | None
-    foreign_events: int | None
 
 
 @dataclass(frozen=True)
@@ -133,12 +128,12 @@ class Vial:
 
 @dataclass(frozen=True)
 class UnitTruth:
-    """All that is found of one unit; account: None for a unit that is told and not judged."""
+    """All that is found of one unit."""
 
     unit: str
     held: tuple[Held, ...]
     vial: Vial
-    account: Account | None
+    account: Account
 
 
 # -- from rows to what they say ----------------------------------------------------------------------------------------
@@ -157,20 +152,8 @@ def phases(journal: Rows, unit: str) -> list[Span]:
     mine = of_unit(journal, unit, "reactor")
     decided = [(row["wall"], row["row"]) for row in mine if row["kind"] == "decision" and row["row"]["phase"] >= 0]
     first = [next(group) for _, group in itertools.groupby(decided, key=lambda each: each[1]["phase"])]
-    return _spans([(wall, row["setpoint"]) for wall, row in first], mine[-1]["wall"] if mine else math.nan)
-
-
-def targets(rows: Rows) -> list[Span]:
-    """The windows of the vendor's turbidostat, by the targets it was given; a row without one ends the last."""
-    told = [(float(row["wall"]), row.get("setpoint")) for row in rows]
-    ends = [wall for wall, setpoint in told if setpoint is None]
-    return _spans([(wall, float(s)) for wall, s in told if s is not None], ends[-1] if ends else math.nan)
-
-
-def _spans(starts: Sequence[tuple[float, float]], end: float) -> list[Span]:
-    """Args: starts: wall time and setpoint of each window. end: of the last; nan: the last is left out."""
-    ends = [*(wall for wall, _ in starts[1:]), end]
-    return [Span(s, wall, e) for (wall, s), e in zip(starts, ends, strict=False) if e > wall]
+    ends = [*(wall for wall, _ in first[1:]), mine[-1]["wall"] if mine else math.nan]
+    return [Span(row["setpoint"], wall, end) for (wall, row), end in zip(first, ends, strict=False) if end > wall]
 
 
 def media_runs(truth: Rows, unit: str) -> tuple[Array, Array]:
@@ -225,11 +208,8 @@ def vial(truth: Rows, unit: str) -> Vial:
     return Vial(volumes.size, float(volumes.sum()), peak, float(rows[-1]["volume_ml"]), not any(duties))
 
 
-def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Account:
-    """The doses of a unit one to one.
-
-    Args: journal, truth: rows of all units. events: the vendor's dosing events, None where they were not recorded.
-    """
+def account(journal: Rows, truth: Rows, unit: str) -> Account:
+    """The doses of a unit one to one. Args: journal, truth: rows of all units."""
     doses, (starts, volumes) = asked(journal, unit), media_runs(truth, unit)
     known = starts < _handed_over(journal, unit)  # what the vendor's turbidostat gives after that is its own
     starts, volumes = starts[known], volumes[known]
@@ -240,7 +220,6 @@ def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Accou
     outside = [max(dose.low_ml - ml, ml - dose.high_ml, 0.0) for dose, ml in given]
     given_ml, booked_ml = float(volumes.sum()), _booked(journal, doses, unit)
     count = Counter(dose.id for dose in doses)
-    untold, foreign = (None, None) if events is None else _told(of_unit(events, unit), doses, first)
     return Account(
         asked=len(doses), runs=starts.size, without_intent=int((owner < 0).sum()),
         twice=int((owner >= 0).sum()) - len(first),
@@ -248,7 +227,7 @@ def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Accou
         cut=len(given) - errors.size, error_mean_ml=_mean(errors), error_max_ml=float(np.abs(errors).max(initial=0.0)),
         outside_ml=max(outside, default=0.0), given_ml=given_ml, booked_ml=booked_ml,
         total_pct=100.0 * (given_ml - booked_ml) / given_ml if given_ml > 0.0 else (math.inf if booked_ml else 0.0),
-        ids_repeated=sum(n > 1 for n in count.values()), ids_untold=untold, foreign_events=foreign,
+        ids_repeated=sum(n > 1 for n in count.values()),
     )  # fmt: skip
 
 
@@ -274,18 +253,11 @@ def _booked(journal: Rows, doses: Sequence[Dose], unit: str) -> float:
     return sum(ends) + sum(dose.ml for dose in doses if math.isinf(dose.end))
 
 
-def _told(events: Rows, doses: Sequence[Dose], given: Iterable[int]) -> tuple[int, int]:
-    """Given doses without an event of their own, and events of the media pump that are of no dose."""
-    sources = [str(row["source_of_event"]) for row in events if row["event"] == "add_media"]
-    ids = {dose.id for dose in doses}
-    return sum(doses[k].id not in sources for k in given), sum(source not in ids for source in sources)
-
-
 # -- against the limits ------------------------------------------------------------------------------------------------
 
 
 def trouble(found: UnitTruth, limits: Limits, volume_ml: float) -> list[str]:
-    """What a judged unit did not keep, one line each. Args: volume_ml: up to the waste tube."""
+    """What a unit did not keep, one line each. Args: volume_ml: up to the waste tube."""
     lines = [] if found.held else ["no window of its schedule is on record"]
     for each in found.held:
         if not each.last_error_od <= limits.error_od:
@@ -295,8 +267,7 @@ def trouble(found: UnitTruth, limits: Limits, volume_ml: float) -> list[str]:
         lines.append(f"{found.vial.peak_ml:.2f} mL in the vial (allowed {volume_ml:g} + {limits.volume_ml:g})")
     if not found.vial.pumps_off:
         lines.append("a pump is on at the end")
-    lines += _accounted(found.account, limits) if found.account else []
-    return [f"{found.unit}: {line}" for line in lines]
+    return [f"{found.unit}: {line}" for line in lines + _accounted(found.account, limits)]
 
 
 def _accounted(a: Account, limits: Limits) -> list[str]:
@@ -306,8 +277,6 @@ def _accounted(a: Account, limits: Limits) -> list[str]:
         "doses given twice": a.twice,
         "doses of the journal without a run of the pump": a.missing,
         "ids given to more than one dose": a.ids_repeated,
-        "doses whose id is in none of the vendor's dosing events": a.ids_untold or 0,
-        "dosing events with an id of no dose": a.foreign_events or 0,
     }
     lines = [f"{what}: {number}" for what, number in counts.items() if number]
     if not a.asked:

@@ -25,7 +25,6 @@ class Run:
     def __init__(self) -> None:
         self.journal: list[Row] = []
         self.truth: list[Row] = [self.vial(wall) for wall in range(990, 1301)]
-        self.events: list[Row] = []
         self.say("decision", 995.0, row={"phase": -1, "setpoint": 0.8})
         for k, wall in enumerate(range(1000, 1300, 15)):
             phase = int(wall >= 1100)
@@ -43,11 +42,10 @@ class Run:
         self.journal.append({"kind": kind, "wall": wall, "reactor": UNIT, **fields})
 
     def dose(self, name: str, wall: float, ml: float, given: float) -> None:
-        """From intent to end, what the vendor told of it, and the pump's run 0.2 s after it."""
+        """From intent to end, and the pump's run 0.2 s after it."""
         self.say("intent", wall, feed_ml=ml, id=name)
         self.say("feed_on", wall, id=name)
         self.say("dose_end", wall + 4.0, feed_ml=ml, feed_low_ml=ml, feed_times=0, id=name, end="")
-        self.events.append({"unit": UNIT, "event": "add_media", "volume_change": ml, "source_of_event": name})
         self.pump(wall + 0.2, given)
 
     def pump(self, start: float, ml: float, pump: str = "media") -> None:
@@ -56,7 +54,7 @@ class Run:
     def judged(self) -> UnitTruth:
         spans = rig_truth.phases(self.journal, UNIT)
         held = tuple(rig_truth.held(span, self.truth, UNIT, SPEED) for span in spans)
-        account = rig_truth.account(self.journal, self.truth, self.events, UNIT)
+        account = rig_truth.account(self.journal, self.truth, UNIT)
         return UnitTruth(UNIT, held, rig_truth.vial(self.truth, UNIT), account)
 
     def trouble(self) -> list[str]:
@@ -69,7 +67,7 @@ class Run:
         return next(row for row in self.truth if row.get("start") == start)
 
     def account(self) -> dict[str, Any]:
-        return asdict(rig_truth.account(self.journal, self.truth, self.events, UNIT))
+        return asdict(rig_truth.account(self.journal, self.truth, UNIT))
 
 
 @pytest.fixture
@@ -103,7 +101,7 @@ def test_every_dose_of_a_sound_run_is_matched_and_only_its_first_window_is_not_h
     assert run.account() == pytest.approx(
         {"asked": 20, "runs": 20, "without_intent": 0, "twice": 0, "missing": 0, "cut": 0, "error_mean_ml": 0.003}
         | {"error_max_ml": 0.003, "outside_ml": 0.003, "given_ml": 24.06, "booked_ml": 24.0}
-        | {"total_pct": 0.06 / 24.06 * 100.0, "ids_repeated": 0, "ids_untold": 0, "foreign_events": 0}
+        | {"total_pct": 0.06 / 24.06 * 100.0, "ids_repeated": 0}
     )
     (line,) = run.trouble()
     assert "0.0200" in line
@@ -113,9 +111,7 @@ def others(run: Run) -> None:
     """A decision without a dose, and rows of other pumps and units."""
     run.say("intent", 1299.0, feed_ml=0.0, id="turbidostat/run/pio01/20")
     run.pump(1299.0, 2.4, "waste")
-    run.truth.append({**run.truth[-1], "pump": "media", "unit": "vendor"})
-    run.events.append({**run.events[0], "unit": "vendor", "source_of_event": "dosing_automation:turbidostat"})
-    run.events.append({**run.events[0], "event": "remove_waste"})
+    run.truth.append({**run.truth[-1], "pump": "media", "unit": "pio02"})
     run.truth.append({"wall": 1299.5, "error": "KeyError: 'unit'"})
 
 
@@ -188,13 +184,8 @@ PLANTED: dict[str, tuple[Callable[[Run], None], dict[str, Any], int]] = {
         lambda run: run.say("dose_end", 1299.0, feed_ml=6.0, feed_times=1, source="somebody"), {"booked_ml": 30.0}, 1,
     ),
     "open": (open_dose, {"asked": 21, "booked_ml": 25.0}, 0),
-    "open, and ran": (open_dose_that_ran, {"asked": 21, "runs": 21, "cut": 1, "ids_untold": 1}, 1),
-    "untold": (lambda run: run.events[6].update(event="remove_waste"), {"ids_untold": 1}, 1),
-    "event of no dose": (
-        lambda run: run.events.append({**run.events[0], "source_of_event": "turbidostat/run/pio01/99"}),
-        {"foreign_events": 1}, 1,
-    ),
-    "one id twice": (one_id_twice, {"ids_repeated": 1, "foreign_events": 1}, 2),
+    "open, and ran": (open_dose_that_ran, {"asked": 21, "runs": 21, "cut": 1}, 0),
+    "one id twice": (one_id_twice, {"ids_repeated": 1}, 1),
     "after the hand-over": (after_the_hand_over, {}, 0),
 }  # fmt: skip
 
@@ -209,11 +200,6 @@ def test_what_is_planted_is_in_the_account_alone_and_told_where_it_is_wrong(run:
     rest = found.keys() - differs.keys() - {*VOLUMES}
     assert {key: found[key] for key in rest} == pytest.approx({key: sound[key] for key in rest})
     assert len(run.trouble()) == 1 + lines, run.trouble()
-
-
-def test_without_recorded_events_nothing_is_said_of_them(run: Run) -> None:
-    account = rig_truth.account(run.journal, run.truth, None, UNIT)
-    assert (account.ids_untold, account.foreign_events) == (None, None)
 
 
 def test_an_offset_of_the_true_od_and_a_window_that_no_truth_covers_are_not_held(run: Run) -> None:
@@ -234,15 +220,7 @@ def test_a_vial_that_fills_and_a_pump_that_is_on(run: Run) -> None:
 
 
 def test_a_unit_of_which_nothing_is_on_record_keeps_nothing(run: Run) -> None:
-    account = rig_truth.account(run.journal, run.truth, run.events, "pio02")
+    account = rig_truth.account(run.journal, run.truth, "pio02")
     found = UnitTruth("pio02", (), rig_truth.vial(run.truth, "pio02"), account)
     assert math.isnan(found.vial.peak_ml)
     assert len(rig_truth.trouble(found, LIMITS, 20.0)) == 4  # no window, no dose, no volume, no pump known to be off
-
-
-def test_the_vendor_s_windows_are_those_of_its_targets() -> None:
-    told = ((10.0, 0.8), (20.0, 0.5), (35.0, None))
-    rows = [{"wall": wall, "setpoint": setpoint} for wall, setpoint in told]
-    found = [(span.setpoint, span.start, span.end) for span in rig_truth.targets(rows)]
-    assert found == [(0.8, 10.0, 20.0), (0.5, 20.0, 35.0)]
-    assert [span.setpoint for span in rig_truth.targets(rows[:2])] == [0.8]  # the last has no end on record
