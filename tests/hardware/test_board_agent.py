@@ -526,16 +526,6 @@ def test_regulating_reactor_is_left_alone_the_other_is_not(short: AgentLab) -> N
 
 
 @pytest.mark.slow
-def test_bye_disarms_and_the_next_request_arms_again(short: AgentLab) -> None:
-    short.pump("Pump3", "M0", 1.0)
-    assert json.loads(short.ask("BYE", "/")[1])["armed"] is False
-    time.sleep(1.6)
-    assert short.motors() == {"M0/Pump3"}
-    assert json.loads(short.ask("PING", "/")[1])["armed"] is True
-    short.until(lambda: not short.motors())
-
-
-@pytest.mark.slow
 def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: AgentLab) -> None:
     short.emulator.fault("bus_stuck_when_pumping")
     short.pump("Pump1", "M0", 0.9)

@@ -95,10 +95,13 @@ def test_od_current_shows_single_readings_while_measuring_then_the_mean_of_their
 
 
 def test_waste_pump_lengthens_the_still_phase_and_beyond_60_s_the_cycle() -> None:
+    """Pumps 3 and 4 lengthen nothing."""
     lab = Lab()
     lab.post("/SetOutputTarget/Pump2/M0/0.5")
     lab.post("/Experiment/1/M0")
     lab.post("/SetOutputOn/Pump2/1/M0")
+    for pump in ("Pump3", "Pump4"):
+        lab.pump(pump, 0.9)
     zero = cycle_start(lab, 2)
     while lab.peek()["Stir"]["ON"] == 0:
         lab.wait(0.05)
@@ -107,15 +110,6 @@ def test_waste_pump_lengthens_the_still_phase_and_beyond_60_s_the_cycle() -> Non
     third = cycle_start(lab, 4)
     assert cycle_start(lab, 5) - third == pytest.approx(69.8, abs=0.5)  # run of the real software: 69.8 s
     assert "too short" in lab.state()["Terminal"]["text"]
-
-
-def test_pumps_3_and_4_do_not_lengthen_anything() -> None:
-    lab = Lab()
-    lab.post("/SetOutputTarget/Pump3/M0/0.9")
-    lab.post("/Experiment/1/M0")
-    lab.post("/SetOutputOn/Pump3/1/M0")
-    second = cycle_start(lab, 2)
-    assert cycle_start(lab, 3) - second == pytest.approx(60.07, abs=0.1)
 
 
 def test_records_grow_to_200_then_201_become_109() -> None:
@@ -136,15 +130,6 @@ def test_records_grow_to_200_then_201_become_109() -> None:
     }
     assert len(data["OD"]["targetrecord"]) == len(data["FP1"]["Emit2Record"]) == 109
     assert data["Heat"]["record"] == []
-
-
-def test_371_cycles_leave_186_records() -> None:
-    """Length seen in a run of the real software while cycle 371 was under way."""
-    data = fresh_sysdata("1", "M0")
-    for k in range(370):
-        append_records(data, 60.07 * k)
-        thin_records(data)
-    assert len(data["time"]["record"]) == 186
 
 
 def test_terminal_is_emptied_every_tenth_cycle_newest_line_first() -> None:
@@ -258,14 +243,6 @@ def test_a_dead_cycle_thread_leaves_a_plausible_picture() -> None:
     lab.post("/Experiment/1/M0")  # recovery used in the field
     lab.wait(20.0)
     assert lab.state()["time"]["record"][-1] > 700.0
-
-
-def test_two_reactors_cycle_independently() -> None:
-    lab = running(wait=25.0)
-    lab.post("/Experiment/1/M1")
-    lab.wait(300.0)
-    assert lab.state("M0")["Experiment"]["cycles"] == 6
-    assert lab.state("M1")["Experiment"]["cycles"] == 5
 
 
 def test_a_pair_that_a_run_is_for_is_its_devices() -> None:

@@ -136,24 +136,6 @@ def test_only_the_selected_reactor_is_served_and_an_absent_one_is_ignored() -> N
     assert lab.state("M0")["Stir"]["target"] == 0.5
 
 
-def test_identities_differ_and_an_absent_position_has_none() -> None:
-    lab = Lab()
-    first, second = lab.state("M0")["DeviceID"], lab.state("M1")["DeviceID"]
-    assert first.isdigit()
-    assert second.isdigit()
-    assert first != second
-    assert lab.device.apps["M4"].data["DeviceID"] == ""
-
-
-def test_after_power_on_nothing_runs_and_the_zero_is_65000() -> None:
-    state = Lab().state()
-    assert state["OD0"]["target"] == 65000.0
-    assert state["Experiment"]["startTime"] == " Waiting "
-    assert state["Experiment"]["cycles"] == 0
-    assert state["Thermostat"]["target"] == 37.0
-    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
-
-
 def test_blanked_start_has_the_zero_an_operator_would_have_set() -> None:
     assert Lab(blanked=True).state()["OD0"]["target"] == BLANK
 

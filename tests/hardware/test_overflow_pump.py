@@ -56,12 +56,6 @@ def test_there_is_none_by_default() -> None:
     assert set(posts(lab)) == {"/SetOutputOn/Pump3/0/M0"}
 
 
-@pytest.mark.parametrize("pump", ["Pump2", "3"])
-def test_only_a_spare_pump_can_be_one(pump: str) -> None:
-    with pytest.raises(ValueError, match=f"overflow_pump.pump = {pump}: allowed Pump3, Pump4, or"):
-        OverflowPumpConfig(pump)
-
-
 @pytest.mark.parametrize(
     ("on", "target", "seen"),
     [

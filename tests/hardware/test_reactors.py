@@ -217,15 +217,6 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
         lab.reactors.begin()
 
 
-def test_a_stored_blank_replaces_the_devices() -> None:
-    lab = DriverLab(blanked=False)
-    measured = ReactorCalibration(SOUND.feed, SOUND.waste, blank=lab.device.vials["M0"].spectrometer.blank)
-    lab.client([measured])
-    lab.reactors.begin()
-    lab.run(3)
-    assert lab.steps[-1].od[0] == pytest.approx(0.5, abs=0.06)
-
-
 # -- samples ---------------------------------------------------------------------------------------------------------
 
 

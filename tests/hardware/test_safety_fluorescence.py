@@ -106,15 +106,6 @@ def test_a_resumed_run_remembers_repeats_and_silence() -> None:
     assert verdict.reasons[0].count("the same in 6 samples") == 1
 
 
-def test_a_state_of_an_earlier_version_fits() -> None:
-    state = Interlock(2).state()
-    for key in ("_light", "_light_repeats", "_light_s"):
-        del state[key]
-    interlock = Interlock(2)
-    interlock.restore(json.loads(json.dumps(state).replace("-Infinity", "null").replace("NaN", "null")))
-    assert interlock.state()["_light"] == [None, None]
-
-
 def test_a_temperature_is_cut_to_the_limits_and_that_is_said_once() -> None:
     bench = Bench(5)
     asked = np.array([20.0, 29.0, 33.2, 37.5, NAN])

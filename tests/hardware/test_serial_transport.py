@@ -19,7 +19,6 @@ import pytest
 
 from hardware.board.board_agent import encode_reply
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.protocol import parse_state
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import DeviceClock
 from hardware.emulator.process import EmulatorProcess
@@ -236,16 +235,6 @@ def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
             agent.wait(10.0)
             log.close()
             line.close()
-
-
-def test_the_agents_reduced_state_is_a_state(cable: tuple[Cable, EmulatorProcess]) -> None:
-    line, _ = cable
-    with open_transport(config(line.pc), "") as link:
-        link.post("/changeDevice/M1")
-        body = link.get("/getSysdata/").body
-    assert len(body) < 1024
-    found = parse_state(body)
-    assert (found.selected, found.present, found.running) == ("M1", ("M0", "M1"), False)
 
 
 def test_on_a_noisy_line_every_request_is_carried_out_exactly_once(cable: tuple[Cable, EmulatorProcess]) -> None:
