@@ -12,8 +12,6 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
-import pytest
-
 from hardware.safety.config import RESPONSES, WORDS, Responses, SafetyConfig
 
 ROOT = Path(__file__).parents[1]
@@ -283,23 +281,3 @@ def test_every_reason_of_the_interlock_is_on_the_page_with_its_response():
     assert told == {kind: {word} for kind, word in RESPONSES.items()}
     chosen = {f.name: SafetyConfig().response(f.name) for f in fields(Responses)}
     assert chosen == {kind: WORDS[RESPONSES[kind]] for kind in chosen}
-
-
-@pytest.mark.parametrize(
-    ("source", "call", "said"),
-    [
-        ("def f(s):\n s.tell('pumps off')", "tell", {"pumps off"}),
-        ("def f(s, n):\n s.tell(f'after {n:.0f} s')", "tell", {"after … s"}),
-        ("def f(s):\n if why := s.old() or 'new':\n  s.tell(f'no: {why}')", "tell", {"no: …", "no: new"}),
-        ("def g():\n return 'late'\ndef f(s):\n s.tell(g())", "tell", {"late"}),
-        ("def f(a):\n log.tell(f'{a} on')\ndef g():\n f('x')\n f('y')", "tell", {"x on", "y on"}),
-        ("def f(s):\n log.warning('%s: %.1f %s', s, 1, 'a' if s else 'b')", "warning", {"…: … a", "…: … b"}),
-        ("def f():\n Fault('link', str(1), 'look')", "Fault", {"link: …; look"}),
-        ("def f(c):\n Finding('hot', c, lambda i: f'{c[i]} degC')", "Finding", {"hot: … degC"}),
-        ("def f(c):\n for k, r in c({'bottle': 1}):\n  Finding(k, r, lambda i: 'none')", "Finding", {"bottle: none"}),
-    ],
-)
-def test_words_are_found_in_source(tmp_path, source, call, said):
-    path = tmp_path / "a.py"
-    path.write_text(source)
-    assert said_in(path, {call: {**TELLS, **LOGS, "Finding": finding}[call]}) == said

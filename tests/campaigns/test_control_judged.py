@@ -65,35 +65,36 @@ def test_a_cooldown_that_never_ends_is_not_back_after_the_fault() -> None:
     assert outcome.reason == "falls"
 
 
+ASTRAY = {"strayed", "not back", "neighbour strayed", "neighbour not back"}
+
+
 @pytest.mark.slow
-def test_a_constant_rate_strays_without_any_fault() -> None:
+@pytest.mark.parametrize(
+    ("rate", "fault", "moment", "wrong"),
+    [
+        (0.004, None, "dose", {"strayed", "neighbour strayed"}),  # without any fault
+        (0.0, "a request is lost", "recovery", ASTRAY),
+    ],
+)
+def test_a_controller_that_pumps_a_constant_rate_is_found(
+    rate: float, fault: str | None, moment: str, wrong: set[str]
+) -> None:
     constant = rehearsed(("M0", "M1"), SCHEDULE, controller="hold")
-    constant = replace(constant, controller=replace(constant.controller, rate=0.004))
-    assert {"strayed", "neighbour strayed"} <= set(ChiBioCase(None, "dose", constant, 3).run().wrong)
+    constant = replace(constant, controller=replace(constant.controller, rate=rate))
+    declared = by_name((fault,))[0] if fault else None
+    assert wrong <= set(ChiBioCase(declared, moment, constant, 3).run().wrong)
 
 
 @pytest.mark.slow
-def test_a_controller_that_does_nothing_strays_from_the_recovery_on() -> None:
-    idle = replace(rehearsed(("M0", "M1"), SCHEDULE, controller="hold"))
-    idle = replace(idle, controller=replace(idle.controller, rate=0.0))
-    outcome = ChiBioCase(by_name(("a request is lost",))[0], "recovery", idle, 3).run()
-    assert {"strayed", "not back", "neighbour strayed", "neighbour not back"} <= set(outcome.wrong)
-
-
-@pytest.mark.slow
-def test_a_driver_that_doses_no_more_after_a_fault_is_found() -> None:
-    restarted = by_name(("worker restarted",))[0]
-    outcome = run(replace(restarted, begin=both(restarted.begin, mute(0, 1))))
-    assert {"strayed", "not back", "neighbour strayed", "neighbour not back"} <= set(outcome.wrong)
+@pytest.mark.parametrize(
+    ("name", "silent", "wrong"),
+    [("worker restarted", (0, 1), ASTRAY), ("OD jumps once", (1,), {"neighbour strayed", "neighbour not back"})],
+)
+def test_a_driver_that_doses_no_more_is_found(name: str, silent: tuple[int, ...], wrong: set[str]) -> None:
+    [fault] = by_name((name,))
+    outcome = run(replace(fault, begin=both(fault.begin, mute(*silent))))
+    assert ASTRAY & set(outcome.wrong) == wrong
     assert outcome.rows_lost == outcome.doses_doubled == 0
-
-
-@pytest.mark.slow
-def test_a_driver_that_forgets_the_neighbour_is_found() -> None:
-    jumps = by_name(("OD jumps once",))[0]
-    outcome = run(replace(jumps, begin=both(jumps.begin, mute(1))))
-    assert {"neighbour strayed", "neighbour not back"} <= set(outcome.wrong)
-    assert not {"strayed", "not back"} & set(outcome.wrong)
 
 
 @pytest.mark.slow

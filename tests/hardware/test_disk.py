@@ -47,6 +47,25 @@ def _no_descriptor_is_left() -> Iterator[None]:
     assert set(os.listdir("/proc/self/fd")) <= before
 
 
+@pytest.mark.parametrize("data", ["µ = 0.04\n", b"\x00\xff", ""])
+def test_an_atomic_file_is_written_whole_or_not_at_all(
+    tmp_path: Path, data: bytes | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, whole = tmp_path / "s", data.encode() if isinstance(data, str) else data
+    path.write_text("old")
+    atomic.write(path, data, fsync=False)
+    assert path.read_bytes() == whole
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        atomic.write(path, "new")
+    assert path.read_bytes() == whole
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_an_atomic_file_is_synced_before_it_takes_its_place_and_its_name_after(tmp_path: Path, tape: Tape) -> None:
     atomic.write(tmp_path / "s", "µm", fsync=False)
     assert tape == [("replace", "s.part", "s")]

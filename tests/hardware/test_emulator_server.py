@@ -24,22 +24,26 @@ from tests.patience import PATIENCE_S
 ROOT = Path(__file__).parents[2]
 
 
-class Process:
-    """`python -m hardware.emulator` on free ports."""
+def until(condition: Callable[[], object], timeout: float = PATIENCE_S) -> None:
+    """Wait until `condition()` holds."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+class Served:
+    """The emulator in a thread of this process, which starts in no time."""
 
     def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        self.ready = self.process.stdout.readline()
-        found = re.search(r"http://127.0.0.1:(\d+) .*control http://127.0.0.1:(\d+)", self.ready)
-        assert found, self.ready
-        self.port, self.control_port = int(found[1]), int(found[2])
+        self.server = EmulatorServer(build(parser().parse_args(arguments)), "127.0.0.1", 0, 0)
+        self.port, self.control_port = self.server.port, self.server.control_port
+        self._thread = threading.Thread(target=self.server.run)
+        self._thread.start()
+
+    def end(self) -> None:
+        self.server.stop()
+        self._thread.join()
 
     def ask(self, method: str, path: str, port: int | None = None, timeout: float = 5.0) -> tuple[int, bytes]:
         connection = HTTPConnection("127.0.0.1", port or self.port, timeout=timeout)
@@ -55,34 +59,6 @@ class Process:
 
     def truth(self) -> dict:  # type: ignore[type-arg]
         return dict(json.loads(self.ask("GET", "/_emulator/truth", self.control_port)[1]))
-
-    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        self.process.send_signal(number)
-        output, _ = self.process.communicate(timeout=5)
-        return self.process.returncode, output
-
-
-def until(condition: Callable[[], object], timeout: float = PATIENCE_S) -> None:
-    """Wait until `condition()` holds."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
-
-
-class Served(Process):
-    """The same in a thread of this process, which starts in no time."""
-
-    def __init__(self, *arguments: str) -> None:
-        self.server = EmulatorServer(build(parser().parse_args(arguments)), "127.0.0.1", 0, 0)
-        self.port, self.control_port = self.server.port, self.server.control_port
-        self._thread = threading.Thread(target=self.server.run)
-        self._thread.start()
-
-    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        self.server.stop()
-        self._thread.join()
-        return 0, ""
 
 
 @pytest.fixture
@@ -214,9 +190,13 @@ def test_garbage_on_the_socket_does_not_end_it(emulator: Served) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_cleanly_and_it_says_one_line_when_it_is_ready(number: int) -> None:
-    process = Process()
-    assert process.ready.count("\n") == 1
-    assert process.end(number) == (0, "")
+    command = [sys.executable, "-m", "hardware.emulator", "--port", "0"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    assert re.search(r"http://127.0.0.1:\d+ .*control http://127.0.0.1:\d+", process.stdout.readline())
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, said) == (0, "")
 
 
 @pytest.mark.slow

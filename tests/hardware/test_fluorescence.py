@@ -125,9 +125,7 @@ def test_without_it_nothing_is_switched_and_nothing_measured() -> None:
     assert "fluorescence" not in bench.of("sample")[-1]
 
 
-@pytest.mark.parametrize(
-    ("found", "set_anew"), [(COMMAND, 0), (COMMAND.replace("LEDA", "LEDB"), 1)]
-)
+@pytest.mark.parametrize(("found", "set_anew"), [(COMMAND, 0), (COMMAND.replace("LEDA", "LEDB"), 1)])
 def test_a_slot_that_is_on_is_toggled_only_if_its_settings_are_others(found: str, set_anew: int) -> None:
     bench = lab()
     bench.wire.inner.post("/changeDevice/M0")

@@ -272,26 +272,6 @@ def test_the_emulator_of_a_run_ends_with_it() -> None:
     assert subprocess.run(["kill", "-0", str(pid)], check=False, stderr=subprocess.DEVNULL).returncode != 0
 
 
-def test_ctrl_c_in_the_middle_of_a_request_leaves_a_link_that_can_still_switch_off(server: Server) -> None:
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        with link(server.url) as transport:
-            for _ in range(2):
-                server.behave = silent
-                late = threading.Timer(0.1, signal.raise_signal, [signal.SIGTERM])
-                late.start()
-                with pytest.raises(KeyboardInterrupt):
-                    transport.get("/getSysdata/")
-                late.join()
-                server.behave = lambda c, _: c.sendall(OK)
-                while True:  # the one worker is still busy with the interrupted request
-                    with contextlib.suppress(LinkError):
-                        assert transport.post("/SetOutputOn/Pump1/0/M0").status == 204
-                        break
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 @pytest.mark.parametrize(
     ("code", "step", "least"), [("site-packages/http", 29, 1000), ("hardware/link/http.py", 1, 30)]
 )

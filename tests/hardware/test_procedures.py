@@ -24,18 +24,6 @@ def test_a_blank_is_the_mean_of_the_counts_of_its_own_reactor() -> None:
         assert lab.device.apps[name].data["OD0"]["target"] == pytest.approx(mean[i], abs=1e-6)
 
 
-@pytest.mark.parametrize("cold", ["M0", "M1"])
-def test_a_blank_waits_for_the_coldest_vial(cold: str) -> None:
-    """One at 37 degC from the start, and one at 27 that its heater warms by 2 degC/min."""
-    lab = begun(("M0", "M1"), od=0.001, blanked=False)
-    lab.device.vials[cold].plant.thermal.reset(27.0)
-    lab.device.vials[cold].plant.thermal.set_target(37.0)
-    farthest = [degc for _, degc in warm_up(lab.reactors, 0.7, 20.0, every_min=1.0)]
-    assert min(farthest) < 32.0
-    true = [float(lab.device.vials[name].plant.thermal.temperature[0]) for name in lab.names]
-    assert true == pytest.approx([37.0, 37.0], abs=0.7)
-
-
 def test_no_blank_is_taken_while_something_is_wrong() -> None:
     lab = begun(od=0.001, blanked=False)
     before = lab.device.apps["M0"].data["OD0"]["target"]

@@ -166,11 +166,15 @@ class Cable:
         self._board_master, self._board_slave = self._pty(self.board)
         self._rng = np.random.default_rng(0)
         self.noise = 0.0  # probability that a chunk is damaged
+        self.mode = "pass"  # or what carries nothing
         self._end = threading.Event()
         self._lock = threading.Lock()
         self.plug()
         self._thread = threading.Thread(target=self._relay, daemon=True)
         self._thread.start()
+
+    def set(self, mode: str) -> None:
+        self.mode = mode
 
     @staticmethod
     def _pty(name: Path) -> tuple[int, int]:
@@ -199,7 +203,7 @@ class Cable:
                     other = self._pc_master if end == self._board_master else self._board_master
                     if data and self._rng.random() < self.noise:
                         data[int(self._rng.integers(len(data)))] ^= 0x15
-                    if other >= 0:
+                    if other >= 0 and self.mode == "pass":
                         os.write(other, data)
             time.sleep(0.002)
 

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.hardware.test_serial_transport import Cable
 from tests.vendor import judge
 from tests.vendor.bench import BENCHES, SPEED, START_OD, Agent, Client, weigh
-from tests.vendor.link import Link, Rule, SerialLine
+from tests.vendor.link import Link, Rule
 
 TOLD_S = 100.0
 VOLUME_SHARE, VOLUME_ML = 0.05, 0.1
@@ -41,8 +42,8 @@ class Case:
         self.calibration = weigh(kind, folder.parent, self.reactors, unit)
         folder.mkdir(parents=True)
         self.bench = BENCHES[kind](folder / "device", self.reactors, unit, START_OD if fault.runs else 0.0)
-        self.serial = SerialLine() if agent == "serial" else None
-        self.agent = Agent(self.bench, folder, self.serial.board if self.serial else "") if agent else None
+        self.serial = Cable(folder) if agent == "serial" else None
+        self.agent = Agent(self.bench, folder, str(self.serial.board) if self.serial else "") if agent else None
         near = self.agent.url if self.agent and not self.serial else self.bench.url
         self.link = Link(near, SPEED)
         self.cable = self.serial or self.link

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import select
 import socket
 import struct
-import termios
 import threading
 import time
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -175,34 +172,3 @@ class Link:
                 return answer
         except OSError:
             return b""
-
-
-class SerialLine:
-    """A serial line as two ptys, `board` and `pc`, and a thread that carries bytes between them while it may `pass`."""
-
-    def __init__(self) -> None:
-        self._ends = [os.openpty(), os.openpty()]
-        for master, slave in self._ends:
-            tty.setraw(master, termios.TCSANOW)
-            tty.setraw(slave, termios.TCSANOW)
-        self.board, self.pc = (os.ttyname(slave) for _, slave in self._ends)
-        self._cut = self._closed = False
-        self._thread = threading.Thread(target=self._carry, daemon=True)
-        self._thread.start()
-
-    def set(self, mode: str) -> None:
-        self._cut = mode != "pass"
-
-    def _carry(self) -> None:
-        (left, _), (right, _) = self._ends
-        while not self._closed:
-            for end in select.select([left, right], [], [], 0.05)[0]:
-                data = os.read(end, 4096)
-                if not self._cut:
-                    os.write(right if end == left else left, data)
-
-    def close(self) -> None:
-        self._closed = True
-        self._thread.join()
-        for end in (end for pair in self._ends for end in pair):
-            os.close(end)
