@@ -126,24 +126,6 @@ def test_faults_of_the_overflow_pump_itself(name: str) -> None:
     assert of_table(name, guarded=True).ok, of_table(name, guarded=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("minutes", [3.0, 30.0])
-def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_chance(
-    tmp_path: Path, minutes: float
-) -> None:
-    r = Rehearsal(tmp_path, rehearsed(("M0", "M1", "M2"), SCHEDULE))
-    r.begin()
-    for _ in r.run(600.0):
-        pass
-    r.close()
-    r.wait(60.0 * minutes)
-    r.begin()
-    words = [reason for step in r.run(r.clock.now() + 600.0) for reason in step.reasons if reason]
-    assert [word for word in words if word.startswith(("stale", "lost", "silent"))] == []
-    r.reactors.stop()
-    r.close()
-
-
 def test_rigs_with_and_without_overflow_pump_are_counted_apart() -> None:
     names = ("waste blocked", "overflow pump blocked", "feed blocked")
     config = FaultsConfig(faults=names, moments=("dose",), controls=1)

@@ -12,7 +12,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
-from hardware.safety.config import DONE, REMEDIES, RESPONSES, Response, Responses, SafetyConfig
+from hardware.safety.config import DONE, REMEDIES, RESPONSES, Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict, kinds_of
 
 
@@ -307,22 +307,6 @@ def test_state_of_another_run_is_refused() -> None:
 
 
 # -- declarations ----------------------------------------------------------------------------------------------------
-
-
-def test_a_reason_that_is_only_reported_lets_the_dose_pass() -> None:
-    config = SafetyConfig(responses=Responses(no_dilution="report"))
-    sound = replace(plant_preset("bench"), sensor=NOISY)
-    vials = Plant(sound, 1, np.random.default_rng(0))
-    vials.feed.gain_factor[:] = 0.0
-    drive = Drive(config)
-    seen = False
-    for _ in range(60):
-        verdict = drive(od=float(vials.read_od()[0]), rate=0.02)
-        if "no_dilution" in only(verdict):
-            seen = True
-            assert verdict.rate[0] == 0.02
-        vials.advance(1.0, np.zeros(1))
-    assert seen
 
 
 def test_a_pump_too_weak_for_the_setpoint_is_told_for_as_long_as_that_lasts() -> None:

@@ -10,7 +10,6 @@ from envs.bench import Bench
 from envs.scenario import Scenario
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
-from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
 from tests.campaigns.rehearsal import SOUND
@@ -299,18 +298,6 @@ def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
     assert lab.reactors.stations[0].book.fault is None
 
 
-def test_no_dose_when_the_device_lies() -> None:
-    lab = begun()
-    fixed(lab, 0.0)
-    lab.run(2)
-    fixed(lab, 0.02)
-    lab.fault("lying", -1)
-    lab.run(10)
-    assert not doses(lab)
-    assert "undosed" in lab.kinds()
-    assert any("not as set" in row["note"] for row in lab.of("note"))
-
-
 def test_a_pump_that_no_command_reaches_is_reported() -> None:
     lab = begun(stop_s=10.0, rate=0.02)
     while not lab.step().rows.any():
@@ -354,23 +341,6 @@ def test_a_blank_changed_by_someone_stops_dosing(blank: float) -> None:
     assert "blank" in lab.kinds()
     assert lab.truth()["feed_ml"] == fed
     assert "from 1" in next(row["fault"] for row in lab.of("fault") if row["fault"])  # to what, and from what
-
-
-def test_a_count_that_is_no_number_is_no_reading_to_dose_by() -> None:
-    lab = begun(od=0.7, minutes=3)
-    optics = lab.device.apps["M0"].optics
-    whole = optics.measure_od
-
-    def blinded(*arguments: Any) -> Any:
-        yield from whole(*arguments)
-        lab.device.apps["M0"].data["OD0"]["raw"] = math.nan
-
-    optics.measure_od = blinded  # type: ignore[method-assign]
-    lab.run(2)
-    fed = lab.truth()["feed_ml"]
-    lab.run(5)
-    assert "impossible" in lab.kinds()
-    assert lab.truth()["feed_ml"] == fed
 
 
 def test_exchanged_reactors_end_control_of_both() -> None:
@@ -506,29 +476,6 @@ def test_each_reactor_is_dosed_by_its_own_pumps_and_has_its_own_volume_and_blank
     assert [s[2:4] for s in sent if s[0] == "CalibrateOD"] == [["M3", "13000.000000"]]
 
 
-def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
-    lab = begun(minutes=5)
-    assert lab.reactors.regulate(np.array([True]), np.array([0.5])) == []
-    lab.run(30)
-    lab.reactors.stop()  # leaves it to itself
-    data = lab.device.apps["M0"].data
-    assert data["OD"]["ON"] == 1
-    assert lab.truth()["od"] == pytest.approx(0.5, abs=0.1)
-    assert lab.reactors.stations[0].book.fault is None
-
-
-def test_control_that_is_taken_back_is_on_record_and_stays_so_when_resumed() -> None:
-    lab = begun(("M0", "M1"), minutes=2)
-    assert lab.reactors.regulate(np.array([False, True]), np.array([0.4, 0.6])) == []
-    assert lab.reactors.handed_over.tolist() == [False, True]
-    assert lab.device.apps["M1"].data["OD"]["target"] == 0.6
-    assert replay(lab.rows)["M1"].handed_over == 0.6
-    assert lab.reactors.give_up(np.array([False, True])) == []
-    assert [(row["reactor"], row["setpoint"]) for row in lab.of("regulate")] == [("M1", 0.6), ("M1", None)]
-    assert math.isnan(replay(lab.rows)["M1"].handed_over)
-    assert lab.device.apps["M1"].data["OD"]["ON"] == 0
-
-
 def test_each_device_is_heated_stirred_and_told_its_volume_as_the_run_has_it() -> None:
     lab = DriverLab(("M0", "M1"), temperature=33.5, stir=0.7)
     bench = Bench(volume_ml=18.0, volumes_ml={"M1": 23.0})
@@ -560,13 +507,6 @@ def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float,
     assert lab.motors_off()
 
 
-def test_a_stop_that_cannot_be_verified_says_so_and_what_to_do() -> None:
-    lab = begun(stop_s=20.0)
-    lab.fault("crash")
-    with pytest.raises(DeviceStateError, match="M0: .*refused.*by hand"):
-        lab.reactors.stop()
-
-
 def test_end_stops_the_experiments_too() -> None:
     lab = begun(("M0", "M1"), minutes=3)
     lab.reactors.end()
@@ -587,21 +527,6 @@ def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
         lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
     assert not doses(lab)
     lab.reactors.stop()
-
-
-def test_a_full_disk_does_not_stand_in_the_way_of_pumps_off() -> None:
-    lab = begun(rate=0.02)
-    m = lab.reactors.measure()
-    lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
-
-    def full(kind: str, fields: Any) -> None:
-        raise RecordingError("journal: No space left on device")
-
-    lab.reactors._log = full
-    with pytest.raises(RecordingError):
-        lab.reactors.measure()
-    lab.reactors.stop()
-    assert lab.motors_off()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -641,22 +566,3 @@ def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: i
         lab.truth()["feed_ml"] <= lab.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
     )
     assert lab.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
-
-
-def test_a_dose_left_open_and_ended_by_something_else_is_booked_as_long_as_that_may_have_taken() -> None:
-    lab = begun(options=quiet(mu=0.025), rate=0.01)
-    lab.step()  # begins a dose, whose end this client does not live to see
-    lab.clock.sleep(100.0)
-    for pump in (1, 2):
-        lab.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
-    lab.clock.sleep(20.0)
-    lab.resume()
-    assert len(doses(lab)) == 2
-    notes = [row["note"] for row in lab.of("note")]
-    assert "left open by an earlier life" in notes[0]
-    assert "repeated up to 1 times by the device" in notes[1]
-    again = [(float(r.volume_ml[0]), float(r.low_ml[0])) for _, r in lab.reactors.repeated()]
-    # of one dose and one repetition that is at most what was given, nothing is certain: the dose was booked already
-    assert sum(most for most, _ in again) == pytest.approx(0.6, rel=1e-3)
-    assert sum(least for _, least in again) == pytest.approx(-0.6, rel=1e-3)
-    assert lab.reactors.repeated() == []

@@ -589,8 +589,10 @@ def test_a_step_is_acted_on_only_where_it_is_no_more_than_reported(jump: str, be
     for minute, od, fresh in ((0, [0.5, 0.5, 0.5], True), (1, [0.8, 0.51, 0.51], np.array([True, True, False]))):
         of = Measurement(np.full(3, 60.0 * minute), np.array(od), np.full(3, 37.0), np.full(3, True) & fresh)
         answer = interlock.believes(of).tolist()
-        interlock.check(of, np.full(3, 0.01), np.full(3, 0.5), np.full(3, 37.0), 60.0 * minute)
+        verdict = interlock.check(of, np.full(3, 0.01), np.full(3, 0.5), np.full(3, 37.0), 60.0 * minute)
     assert answer == believed
+    assert (verdict.rate > 0.0).tolist() == believed
+    assert verdict.kinds[0] == ("jump",)
 
 
 def test_a_receipt_without_waste_leaves_the_level_at_its_tube() -> None:

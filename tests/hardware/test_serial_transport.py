@@ -11,22 +11,18 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hardware.board.board_agent import encode_reply
-from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.reactors import ChiBioReactors
-from hardware.clock import DeviceClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.open import open_transport
 from hardware.link.serial import SerialTransport
 from hardware.link.transport import Reply, TransportConfig
-from hardware.reactor import Command
 from tests.patience import PATIENCE_S
 
 AGENT = Path(__file__).parents[2] / "hardware" / "board" / "board_agent.py"
@@ -251,41 +247,3 @@ def test_on_a_noisy_line_every_request_is_carried_out_exactly_once(cable: tuple[
         assert json.loads(link.get("/getSysdata/").body)["Pump3"]["ON"] == (k + 1) % 2, k
     line.noise = 0.0
     link.close()
-
-
-@pytest.mark.slow
-def test_a_run_over_a_noisy_line_that_is_unplugged_for_a_while(cable: tuple[Cable, EmulatorProcess]) -> None:
-    line, _ = cable
-    settings = ChiBioConfig(speed=60.0, reactors=("M0", "M1"), transport=config(line.pc, connect_s=3.0, read_s=20.0))
-    own = ExitStack()
-    transport = own.enter_context(open_transport(settings.transport, settings.url, 60.0))
-    rows: list[dict[str, object]] = []
-    reactors = ChiBioReactors(transport, DeviceClock(60.0), settings, log=lambda k, f: rows.append({"kind": k, **f}))
-    reactors.begin()
-    line.noise = 0.01
-    samples: list[float] = []
-
-    def go(enough: Callable[[], bool]) -> float:
-        """Run until enough was seen; device s."""
-        until = time.monotonic() + PATIENCE_S
-        while not enough():
-            assert time.monotonic() < until
-            m = reactors.measure()
-            reactors.actuate(Command(m.fresh, np.where(m.fresh, 0.008, 0.0), np.full(2, 37.0)))
-            samples.extend([reactors.elapsed()] * int(m.fresh.sum()))
-        return reactors.elapsed()
-
-    go(lambda: len(samples) >= 5)
-    line.unplug()
-    cut = reactors.elapsed()
-    plugged = go(lambda: reactors.elapsed() > cut + 120.0)
-    assert not [t for t in samples if cut + 1.0 < t < plugged]
-    line.plug()
-    before = len(samples)
-    go(lambda: len(samples) >= before + 6)
-    reactors.stop()
-    own.close()
-    acted = [(r["reactor"], *r["sample"]) for r in rows if r["kind"] == "intent"]  # type: ignore[misc]
-    assert len(set(acted)) == len(acted)
-    assert [r["not_verified"] for r in rows if r["kind"] == "stop"] == [[]]
-    assert any("link" in str(r["fault"]) for r in rows if r["kind"] == "fault")
