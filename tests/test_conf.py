@@ -188,7 +188,7 @@ def test_every_field_of_every_command_says_what_it_is(name):
 
 
 @pytest.mark.parametrize("name", EACH)
-def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
+def test_help_shows_usage_every_value_and_options_that_compose(name, capsys, monkeypatch):
     command = importlib.import_module(f"experiments.{name}").main
     pages = {}
     for word in ("--help", "--help=all"):
@@ -208,6 +208,16 @@ def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
         part = capsys.readouterr().out.splitlines()
         assert part
         assert set(part) <= whole
+    listed = {}
+    for line in pages["--help=all"].partition("Values (key=value)")[0].splitlines():
+        if group := re.match(r"  ([\w/]+)=(?: |$)", line):
+            listed[group[1]] = []
+        elif option := re.match(r"    (\w+)  ", line):
+            listed[[*listed][-1]].append(option[1])
+    assert all(listed.values())
+    for group in listed.keys() - {"backend/transport"}:  # stands under a backend that has one
+        for option in listed[group]:
+            command.config([f"{group}={option}"])
 
 
 def test_help_of_a_part_that_there_is_not_names_those_that_there_are():
@@ -227,21 +237,6 @@ def test_help_shows_the_values_that_the_rest_of_the_line_gives(capsys, monkeypat
 def test_the_configuration_page_is_that_of_the_code():
     """Written anew by `python -m experiments.cli.reference > docs/configuration.md`."""
     assert (CONF.parent / "docs" / "configuration.md").read_text(encoding="utf-8") == reference.page()
-
-
-@pytest.mark.parametrize("override", ["agent.relabelled=0.5", "++agent.relabelled=0.5", "+agent.relabelled=0.5"])
-def test_an_unknown_key_on_the_command_line_is_named(override):
-    with pytest.raises(
-        frame.UserError, match=r"^agent\.relabelled: no such key; allowed under agent: .*hindsight_share"
-    ):
-        load_train(override)
-
-
-def test_an_unknown_option_of_a_group_is_named():
-    with pytest.raises(frame.UserError, match=r"^controller=turbidostat: no such option; allowed: .*threshold"):
-        load_deploy("controller=turbidostat")
-    with pytest.raises(ValueError, match=r"^controller\.kind = turbidostat: allowed .*threshold"):
-        deploy_schema("sim", "turbidostat")
 
 
 def test_an_unknown_key_in_a_file_is_named(tmp_path):
@@ -312,31 +307,51 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
 
 
 @pytest.mark.parametrize(
-    ("override", "parts"),
+    ("name", "override", "parts"),
     [
-        ("env.mu=abc", ["env.mu", "abc", "a number, 0 < mu"]),
-        ("env.mu=nan", ["env.mu", "nan", "allowed"]),
-        ("env.nois=1", ["env.nois", "no such key", "mu, tau"]),
-        ("foo=1", ["foo", "no such key", "n_agents"]),
-        ("lr=1", ["lr", "agent.learning_rate", "env, agent"]),
-        ("env=simm", ["env=simm", "no such option", "sim"]),
-        ("+experiment=nope", ["experiment=nope", "no such option", "smoke"]),
-        ("seed=1.5", ["seed", "1.5", "a whole number"]),
-        ("agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
-        ("agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
-        ("env=null", ["group"]),
-        ("agent.hidden=[", ["["]),
-        ("seed=range(0,4)", ["seed=range(0,4)", "-m 'seed=range(0,4)'"]),
-        ("seed=1,2", ["seed=1,2", "-m 'seed=1,2'"]),
+        ("train", "env.mu=abc", ["env.mu", "abc", "a number, 0 < mu"]),
+        ("train", "env.mu=nan", ["env.mu", "nan", "allowed"]),
+        ("train", "env.nois=1", ["env.nois", "no such key", "mu, tau"]),
+        ("train", "foo=1", ["foo", "no such key", "n_agents"]),
+        ("train", "lr=1", ["lr", "agent.learning_rate", "env, agent"]),
+        ("train", "env=simm", ["env=simm", "no such option", "sim"]),
+        ("train", "+experiment=nope", ["experiment=nope", "no such option", "smoke"]),
+        ("train", "seed=1.5", ["seed", "1.5", "a whole number"]),
+        ("train", "agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
+        ("train", "agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
+        ("train", "env=null", ["group"]),
+        ("train", "agent.hidden=[", ["["]),
+        ("train", "seed=range(0,4)", ["seed=range(0,4)", "-m 'seed=range(0,4)'"]),
+        ("train", "seed=1,2", ["seed=1,2", "-m 'seed=1,2'"]),
+        ("train", "agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: ", "hindsight_share"]),
+        ("train", "++agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: "]),
+        ("train", "+agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: "]),
+        ("deploy", "controller=turbidostat", ["controller=turbidostat: no such option; allowed: ", "threshold"]),
+        ("train", "+experiment=paper", ["experiment=paper: a recipe of benchmark"]),
+        ("benchmark", "experiment=smoke", ["experiment=smoke: a recipe of train"]),
+        ("deploy", "+experiment=smoke", ["experiment=smoke: a recipe of train"]),
+        (
+            "train",
+            "plant=bench",
+            ["plant=bench: train takes env, agent, experiment,", "plant= is for deploy"],
+        ),
+        ("benchmark", "plant=bench", ["plant=bench: benchmark takes env, experiment; plant= is for deploy"]),
+        ("report", "agent=tuned", ["agent=tuned: report takes no group; agent= is for train"]),
+        ("mark", "+safety=default", ["safety=default: mark takes no group; safety= is for deploy"]),
     ],
 )
-def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(override, parts):
+def test_a_wrong_word_is_one_line_with_key_value_and_what_is_allowed(name, override, parts):
     with pytest.raises(frame.UserError) as caught:
-        load_train(override)
+        importlib.import_module(f"experiments.{name}").main.config([override])
     message = str(caught.value)
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+def test_an_unknown_law_of_a_run_is_named():
+    with pytest.raises(ValueError, match=r"^controller\.kind = turbidostat: allowed .*threshold"):
+        deploy_schema("sim", "turbidostat")
 
 
 @pytest.mark.parametrize(("word", "remedy"), [("--foo", "foo=VALUE"), ("--seed=3", "seed=3")])
@@ -368,43 +383,6 @@ def test_the_demo_takes_no_words(word, tmp_path, monkeypatch, capsys):
 def test_an_address_that_cannot_be_one_is_refused_with_the_config(backend, key, value):
     with pytest.raises(frame.UserError, match=rf"{key.rpartition('.')[2]} = '?{re.escape(value)}'?: allowed "):
         load_deploy(f"backend={backend}", f"backend.{key}={value}")
-
-
-@pytest.mark.parametrize("name", EACH)
-def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name, capsys, monkeypatch):
-    command = importlib.import_module(f"experiments.{name}").main
-    monkeypatch.setattr(sys, "argv", [name, "--help=all"])
-    command()
-    page = capsys.readouterr().out.partition("Values (key=value)")[0]
-    listed = {}
-    for line in page.splitlines():
-        if group := re.match(r"  ([\w/]+)=(?: |$)", line):
-            listed[group[1]] = []
-        elif option := re.match(r"    (\w+)  ", line):
-            listed[[*listed][-1]].append(option[1])
-    for group, found in listed.items():
-        assert found, group
-        for option in found:
-            if group != "backend/transport":  # stands under a backend that has one
-                command.config([f"{group}={option}"])
-
-
-@pytest.mark.parametrize(
-    ("name", "override", "line"),
-    [
-        ("train", "+experiment=paper", "experiment=paper: a recipe of benchmark"),
-        ("benchmark", "experiment=smoke", "experiment=smoke: a recipe of train"),
-        ("deploy", "+experiment=smoke", "experiment=smoke: a recipe of train"),
-        ("train", "+experiment=nope", "experiment=nope: no such option; allowed: shipped, smoke"),
-        ("train", "plant=bench", "plant=bench: train takes env, agent, experiment, hparams_search; plant= is for de"),
-        ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
-        ("report", "agent=tuned", "agent=tuned: report takes no group; agent= is for train"),
-        ("mark", "+safety=default", "safety=default: mark takes no group; safety= is for deploy"),
-    ],
-)
-def test_a_group_or_recipe_of_another_command_names_the_right_one(name, override, line):
-    with pytest.raises(frame.UserError, match=f"^{re.escape(line)}"):
-        importlib.import_module(f"experiments.{name}").main.config([override])
 
 
 @pytest.mark.parametrize(
