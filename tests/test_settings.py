@@ -137,9 +137,10 @@ def refusal(config: type[Any], key: str, value: Any) -> str:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.__name__)
-def test_default_unit_and_meaning_are_those_of_the_page(config: type[Any]) -> None:
+def test_default_unit_range_and_meaning_are_those_of_the_page(config: type[Any]) -> None:
     for row, entry in zip(rows_of(config), entries(config()), strict=True):
         assert (row.key, row.unit, row.meaning) == (entry.name, entry.said.unit, entry.said.what)
+        assert row.allowed == entry.allowed
         assert row.meaning
         if row.default and not row.default.startswith("["):  # a part has a table of its own
             given = getattr(build(config(), {row.key: yaml.safe_load(row.default.strip("`"))}), row.key)

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from conf.schema import check, part, setting
 from experiments.cli import files, frame
 from experiments.reporting.tables import markdown, number
@@ -98,15 +96,11 @@ def found_in(run: Recorded) -> list[UnitTruth]:
 
 def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
     """table.md: how the setpoints were held, and what became of the doses."""
-    last = f"last {rig_truth.LAST_MIN:.0f} min"
-    head = ("unit", "setpoint", "mean error", f"mean error, {last}", f"bias, {last}", "media, mL")
-    rows = [
-        (u.unit, f"{h.setpoint:g}", *(f"{v:.4f}" for v in (h.error_od, h.last_error_od)), f"{h.last_bias_od:+.4f}",
-         f"{h.media_ml:.2f}") for u in found for h in u.held
-    ]  # fmt: skip
+    head = ("unit", "setpoint", f"mean error, last {rig_truth.LAST_MIN:.0f} min")
+    rows = [(u.unit, f"{h.setpoint:g}", f"{h.last_error_od:.4f}") for u in found for h in u.held]
     doses = ("unit", "doses", "runs of the pump", "error, mL: mean", "largest", "outside of the bound, mL",
              "cut short", "without intent", "twice", "missing", "given, mL", "booked, mL", "difference",
-             "volume, mL: peak", "end")  # fmt: skip
+             "largest volume, mL")  # fmt: skip
     said = [f"Growth {run.speed:g} times faster than real time.", ""]
     return "\n".join([*said, markdown(head, rows), markdown(doses, map(_dose_row, found))])
 
@@ -116,35 +110,12 @@ def _dose_row(u: UnitTruth) -> tuple[str, ...]:
     return (
         u.unit, str(a.asked), str(a.runs), f"{a.error_mean_ml:+.4f}", f"{a.error_max_ml:.4f}", number(a.outside_ml, 2),
         str(a.cut), str(a.without_intent), str(a.twice), str(a.missing), f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}",
-        f"{a.total_pct:+.2f} %", f"{u.vial.peak_ml:.2f}", f"{u.vial.end_ml:.2f}",
+        f"{a.total_pct:+.2f} %", f"{u.vial.peak_ml:.2f}",
     )  # fmt: skip
 
 
-def draw(run: Recorded, found: Sequence[UnitTruth], folder: Path) -> None:
-    """True OD of every unit over setpoint, above the doses that its media pump gave."""
-    from experiments.reporting.charts import COLOURS, new_figure, save
-
-    spans = rig_truth.phases(run.journal, found[0].unit)
-    zero = min((span.start for span in spans), default=0.0)
-    figure, (top, bottom) = new_figure(8.0, 4.8, 2, 1, sharex=True, height_ratios=[2.2, 1.0])
-    for k, u in enumerate(found):
-        seen = [(row["wall"], row["od"]) for row in rig_truth.of_unit(run.truth, u.unit) if "od" in row]
-        wall, od = np.array(seen).reshape(-1, 2).T
-        starts, volumes = rig_truth.media_runs(run.truth, u.unit)
-        top.plot((wall - zero) * run.speed / 60.0, od, color=COLOURS[k], linewidth=1.1, label=u.unit)
-        bottom.plot((starts - zero) * run.speed / 60.0, volumes, ".", color=COLOURS[k], markersize=4.5)
-    for n, span in enumerate(spans):
-        edges = [(at - zero) * run.speed / 60.0 for at in (span.start, span.end)]
-        style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
-        top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
-    top.set(ylabel="true OD", ylim=(0.0, None))
-    top.legend()
-    bottom.set(ylabel="dose, mL", xlabel="time, min of the culture", ylim=(0.0, None))
-    save(figure, folder / "figures", "rig_study")
-
-
 def rig_study(config: RigStudyConfig, folder: Path) -> None:
-    """Run, or take a run that is there; table, figure, summary.json. Raises: UserError where a limit is not met."""
+    """Run, or take a run that is there; table, summary.json. Raises: UserError where a limit is not met."""
     began = time.monotonic()
     run = recorded(Path(config.run) if config.run else deployed(config, folder))
     found = found_in(run)
@@ -153,8 +124,7 @@ def rig_study(config: RigStudyConfig, folder: Path) -> None:
     summary = {"met": not wrong, "speed": run.speed, "not_met": wrong}
     files.write_json(folder / "summary.json", {**summary, "units": units, "wall_s": round(time.monotonic() - began, 1)})
     (folder / "table.md").write_text(table(run, found), encoding="utf-8")
-    draw(run, found, folder)
-    log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "rig_study.png")
+    log.info("table %s", folder / "table.md")
     if wrong:
         raise frame.UserError(f"not met: {'; '.join(wrong)}")
 

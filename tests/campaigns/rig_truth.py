@@ -57,19 +57,10 @@ class Span:
 
 @dataclass(frozen=True)
 class Held:
-    """How a setpoint was held, by the true OD.
-
-    minutes: device min of the window. error_od: mean |OD - setpoint| of all of it; last_error_od, last_bias_od: mean
-    |OD - setpoint| and mean OD - setpoint of its last `LAST_MIN`; nan where nothing is on record. media_ml: given
-    meanwhile.
-    """
+    """Mean distance, OD, of the true OD from a setpoint in the last `LAST_MIN` of its window; nan: not on record."""
 
     setpoint: float
-    minutes: float
-    error_od: float
     last_error_od: float
-    last_bias_od: float
-    media_ml: float
 
 
 @dataclass(frozen=True)
@@ -117,12 +108,9 @@ class Account:
 
 @dataclass(frozen=True)
 class Vial:
-    """A vial: doses and medium that it really got, largest and last volume, mL, whether its pumps are off at last."""
+    """Largest volume in a vial, mL, and whether its pumps are off at last."""
 
-    doses: int
-    media_ml: float
     peak_ml: float
-    end_ml: float
     pumps_off: bool
 
 
@@ -184,14 +172,8 @@ def held(span: Span, truth: Rows, unit: str, speed: float) -> Held:
     """One window. Args: truth: rows of all units. speed: device seconds per real second."""
     seen = [(row["wall"], row["od"]) for row in of_unit(truth, unit) if "od" in row]
     wall, od = np.array(seen, dtype=np.float64).reshape(-1, 2).T
-    inside = (wall >= span.start) & (wall < span.end)
-    last = inside & (wall >= span.end - LAST_MIN * 60.0 / speed)
-    starts, volumes = media_runs(truth, unit)
-    given = volumes[(starts >= span.start) & (starts < span.end)]
-    return Held(
-        span.setpoint, (span.end - span.start) * speed / 60.0, _mean(np.abs(od[inside] - span.setpoint)),
-        _mean(np.abs(od[last] - span.setpoint)), _mean(od[last] - span.setpoint), float(given.sum()),
-    )  # fmt: skip
+    last = (wall >= max(span.start, span.end - LAST_MIN * 60.0 / speed)) & (wall < span.end)
+    return Held(span.setpoint, _mean(np.abs(od[last] - span.setpoint)))
 
 
 def _mean(values: Array) -> float:
@@ -201,11 +183,9 @@ def _mean(values: Array) -> float:
 def vial(truth: Rows, unit: str) -> Vial:
     """What is to be said of a vial; nan where it is in no row."""
     rows = [row for row in of_unit(truth, unit) if "volume_ml" in row]
-    _, volumes = media_runs(truth, unit)
     if not rows:
-        return Vial(volumes.size, float(volumes.sum()), math.nan, math.nan, False)
-    peak, duties = max(float(row["peak_ml"]) for row in rows), rows[-1]["duty"].values()
-    return Vial(volumes.size, float(volumes.sum()), peak, float(rows[-1]["volume_ml"]), not any(duties))
+        return Vial(math.nan, False)
+    return Vial(max(float(row["peak_ml"]) for row in rows), not any(rows[-1]["duty"].values()))
 
 
 def account(journal: Rows, truth: Rows, unit: str) -> Account:

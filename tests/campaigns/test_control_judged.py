@@ -15,14 +15,13 @@ from hardware.reactor import Command, Receipt
 from hardware.safety.config import SafetyConfig
 from tests.campaigns.chibio_case import ChiBioCase
 from tests.campaigns.chibio_faults import Act, both, set_
-from tests.campaigns.endurance import SoakConfig
 from tests.campaigns.fault import Fault
 from tests.campaigns.fault_table import by_name
 from tests.campaigns.killed_run import KillConfig, errors_in_lives, longest_out_min
 from tests.campaigns.kills import kill_campaign
 from tests.campaigns.outcome import Outcome, allowed, judged, table, totals
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
-from tests.campaigns.soak import soak
+from tests.campaigns.soak import SoakConfig, soak
 from tests.campaigns.tracking import Tracking, reachable, undosed
 
 SCHEDULE = Scenario((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)

@@ -15,13 +15,13 @@ from hardware.safety.config import SafetyConfig
 from tests.campaigns.audit import audit_doses
 from tests.campaigns.chibio_case import ChiBioCase
 from tests.campaigns.chibio_faults import both, post, run_device, set_
-from tests.campaigns.endurance import SoakConfig
 from tests.campaigns.fault import FAMILIES, REAL, VIRTUAL, Fault
 from tests.campaigns.fault_table import FAULTS, by_name
 from tests.campaigns.faults import FaultsConfig, all_cases, faults
 from tests.campaigns.killed_run import KillConfig
 from tests.campaigns.outcome import Outcome, declared, judged, table
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
+from tests.campaigns.soak import SoakConfig
 
 SCHEDULE = Scenario((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
 

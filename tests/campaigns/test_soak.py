@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from hardware.storage.recording_reader import read_recording
-from tests.campaigns.endurance import Day, SoakConfig, soak_run
-from tests.campaigns.soak import soak
+from tests.campaigns.soak import Day, SoakConfig, soak, soak_run
 
 
 @pytest.mark.slow

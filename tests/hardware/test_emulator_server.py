@@ -87,7 +87,8 @@ def _an_experiment(emulator: Served) -> None:
     assert [b - a for a, b in zip(state["time"]["record"], state["time"]["record"][1:], strict=False)] == pytest.approx(
         [60.07] * (len(state["time"]["record"]) - 1), abs=1.0
     )
-    assert emulator.ask("GET", "/getSysdata")[0] == 308
+    with urllib.request.urlopen(f"http://127.0.0.1:{emulator.port}/getSysdata", timeout=5) as answer:  # follows 308
+        assert json.load(answer)["UIDevice"] == "M0"
     assert emulator.ask("GET", "/changeDevice/M1")[0] == 405
     assert emulator.ask("POST", "/changeDevice/M11")[0] == 500
 
@@ -161,17 +162,6 @@ def test_truth_doses_and_list_of_faults(emulator: Served) -> None:
     assert text.startswith(b"fault = nonsense: allowed ")
     assert emulator.ask("POST", "/_emulator/fault/od_offset/M0/much")[0] == 400
     assert emulator.ask("GET", "/_emulator/nonsense")[0] == 404
-
-
-def test_httpx_and_urllib_can_talk_to_it(emulator: Served) -> None:
-    import httpx
-
-    with httpx.Client(base_url=f"http://127.0.0.1:{emulator.port}") as client:
-        for _ in range(20):
-            assert client.post("/changeDevice/M1").status_code == 204
-            assert client.get("/getSysdata/").json()["UIDevice"] == "M1"
-    with urllib.request.urlopen(f"http://127.0.0.1:{emulator.port}/getSysdata", timeout=5) as answer:  # follows 308
-        assert json.load(answer)["UIDevice"] == "M1"
 
 
 def test_garbage_on_the_socket_does_not_end_it(emulator: Served) -> None:

@@ -104,18 +104,9 @@ class Ledger:
         self.level = max(self.level + feed - waste, self.tube) if waste != 0.0 else self.level + feed
 
 
-@pytest.mark.parametrize(
-    ("limit", "period_s"),
-    [
-        ("ml_per_minute", 30.0),
-        ("ml_per_hour", 60.0),
-        ("ml_per_run", 60.0),
-        ("bottle_ml", 60.0),
-        ("controller_patience", 60.0),
-    ],
-)
-def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> None:
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("limit", ["ml_per_minute", "ml_per_hour", "ml_per_run", "bottle_ml", "controller_patience"])
+def test_the_ledger_is_that_of_a_list_of_doses(limit: str) -> None:
+    rng, period_s = np.random.default_rng(0), 30.0 if limit == "ml_per_minute" else 60.0
     tight = {"ml_per_minute": 1.9, "ml_per_hour": 14.0, "ml_per_run": 30.0, "controller_patience": 2}
     c = SafetyConfig(**{limit: tight[limit]} if limit in tight else {})
     bench = Bench(period_s=period_s, bottle_ml=30.0 if limit == "bottle_ml" else 2000.0)
@@ -173,18 +164,7 @@ def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
 def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
     readings, new = Readings(1, C, 100.0, 180.0), np.array([True])
     kinds = []
-    for od, fresh in (
-        (0.5, 1),
-        (0.5, 0),
-        (0.5, 1),
-        (0.5, 1),
-        (0.5, 0),
-        (0.5, 1),
-        (0.6, 1),
-        (0.5, 1),
-        (0.5, 1),
-        (0.5, 0),
-    ):
+    for od, fresh in zip([0.5] * 6 + [0.6] + [0.5] * 3, [1, 0, 1, 1, 0, 1, 1, 1, 1, 0], strict=True):
         m = Measurement(np.zeros(1), np.array([od]), np.zeros(1), new, None)
         foreseen = [readings.believed(m, np.array([bool(fresh)]))[0] for _ in range(5)]  # asking changes nothing
         believed, findings = readings.check(m, np.array([bool(fresh)]), 0.0)
@@ -277,16 +257,8 @@ def test_heat_is_judged_as_sample_by_sample() -> None:
             rows = zip(twins, reading, fresh, target, strict=True)
             assert told(findings) == [t.judge(r, f, g, now) for t, r, f, g in rows]
             assert heat.off.tolist() == [t.off for t in twins]
-            same(
-                vars(heat),
-                twins,
-                _relief_c="relief",
-                _target_c="target",
-                _thermo_s="at",
-                _hot="hot",
-                _too_hot="too_hot",
-            )
-            same(vars(heat), twins, _nonsense="nonsense")
+            same(vars(heat), twins, _relief_c="relief", _target_c="target", _thermo_s="at")
+            same(vars(heat), twins, _hot="hot", _too_hot="too_hot", _nonsense="nonsense")
             if rng.random() < 0.1:
                 heat = resumed(heat, Heat(N, config))
 
@@ -444,11 +416,7 @@ def test_after_a_night_growth_explains_a_factor_of_150_and_no_more(reading: floa
 
 @pytest.mark.parametrize(
     ("key", "least", "less", "allowed"),
-    [
-        ("od_max", 1.5, 1.49, "1.5 to 10"),
-        ("stale_s", 66.0, 65.9, "66 to 7200"),
-        ("lost_s", 100.0, 99.9, "100 to 14400"),
-    ],
+    [("od_max", 1.5, 1.49, "1.5 to 10"), ("stale_s", 66.0, 65.9, "66 to 7200"), ("lost_s", 100, 99.9, "100 to 14400")],
 )
 def test_limits_that_rest_on_one_another(key: str, least: float, less: float, allowed: str) -> None:
     SafetyConfig(**{key: least + 1e-9}).ages_s(Bench())

@@ -20,9 +20,8 @@ from experiments.cli import files
 from experiments.reporting import tables
 from experiments.reporting.tables import Table, number
 from tests.entry import command
-from tests.studies import speed_of_control as control
-from tests.studies import speed_of_learning as learning
-from tests.studies.measurement import Measurement, measure
+from tests.studies import measurements
+from tests.studies.measurements import Measurement, measure
 
 __all__ = ["GROUPS", "SpeedConfig", "main", "table"]
 
@@ -49,10 +48,10 @@ class SpeedConfig:
 
 
 GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
-    "training": learning.training,
-    "environment": learning.environment,
-    "controllers": control.loops,
-    "mpc": control.mpc,
+    "training": measurements.training,
+    "environment": measurements.environment,
+    "controllers": measurements.loops,
+    "mpc": measurements.mpc,
 }
 """Name -> measurements. Whoever adds one names a rival that does the same work."""
 

@@ -6,8 +6,8 @@ from itertools import count
 import pytest
 
 from experiments.cli import frame
-from tests.studies import measurement
-from tests.studies.measurement import Measurement, measure
+from tests.studies import measurements
+from tests.studies.measurements import Measurement, measure
 from tests.studies.speed import GROUPS, SpeedConfig, table
 
 pytestmark = pytest.mark.numeric
@@ -32,7 +32,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(measurement.time, "perf_counter", lambda: made.now)
+    monkeypatch.setattr(measurements.time, "perf_counter", lambda: made.now)
     return made
 
 
@@ -52,7 +52,7 @@ def test_pairs_alternate() -> None:
     calls: list[str] = []
     ours, theirs = (lambda name=name: calls.append(name) for name in ("ours", "theirs"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measurement.time, "perf_counter", count().__next__)
+        patch.setattr(measurements.time, "perf_counter", count().__next__)
         measure(Measurement("a", "w", "r", ours, theirs), 5)
     assert calls == ["theirs", "ours", "ours", "theirs"] * 3
 
