@@ -33,7 +33,6 @@ RELATIVE = ("error", "growth_share")
 COCULTURE = ("logit_share", "temperature", "rate", "logit_setpoint")
 COCULTURE_PREVIEW = (*COCULTURE, "logit_next", "minutes_to_change")
 KNOWN = (ABSOLUTE, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
-READABLE = (1, 2)
 
 
 class PolicyError(Exception):
@@ -137,23 +136,21 @@ def load(path: Path) -> Policy:
         raise PolicyError(f"policy {path}: not a policy file ({reason}); {remedy}") from None
     try:
         metadata = json.loads(str(arrays["metadata"]))
-        if metadata.get("format") not in READABLE:
-            allowed = ", ".join(map(str, READABLE))
-            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {allowed}; export it anew")
+        if metadata.get("format") != FORMAT:
+            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {FORMAT}; export it anew")
         if tuple(metadata.get("observation", ())) not in KNOWN:
             allowed = " or ".join(str(list(names)) for names in KNOWN)
             raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
-        first = metadata["format"] == 1
         layers = sum(name.startswith("w") for name in arrays)
         policy = Policy(
             weights=tuple(arrays[f"w{k}"] for k in range(layers)),
             biases=tuple(arrays[f"b{k}"] for k in range(layers)),
             input_matrix=arrays["input_matrix"],
             input_offset=arrays["input_offset"],
-            actions=arrays["pump_rates" if first else "actions"],
-            low=np.full(2, -np.inf, dtype=np.float32) if first else arrays["observation_low"],
-            high=np.full(2, np.inf, dtype=np.float32) if first else arrays["observation_high"],
-            metadata={**metadata, "format": FORMAT},  # which `save` writes
+            actions=arrays["actions"],
+            low=arrays["observation_low"],
+            high=arrays["observation_high"],
+            metadata=metadata,
         )
         q = policy.q_values(np.full((1, len(metadata["observation"])), 0.5))
     except (KeyError, IndexError, ValueError, AttributeError) as error:

@@ -39,7 +39,6 @@ COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
 )  # fmt: skip
-ADDED = ("raw_counts", "blank_counts", "feed_pump", "believed")  # columns of a later version
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -165,8 +164,8 @@ def cut_short(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Ro
 
 
 def _kept(row: Mapping[str, Any], column: str) -> float | int | str | bool | None:
-    """A cell of a decision; nan where there is none, also of a column that an earlier version did not have."""
-    value: float | int | str | bool | None = row.get(column) if column in ADDED else row[column]
+    """Return a cell of a decision; nan where there is none."""
+    value: float | int | str | bool | None = row[column]
     return math.nan if value is None else value
 
 
@@ -244,10 +243,6 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
         raise _no_state(path, str(error)) from None
-    if loop.density.memory is not None and loop.density.name not in state:
-        log.warning(
-            "%s: an earlier version wrote it, without the controller's memory: the controller begins anew", path
-        )
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
     marked = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]

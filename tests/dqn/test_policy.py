@@ -98,7 +98,7 @@ def _metadata(**changes: Any) -> np.ndarray:
         ({"w1": None}, "incomplete or of mismatched shapes"),
         ({"b0": np.zeros(5, np.float32)}, "incomplete or of mismatched shapes"),
         ({"metadata": np.array("not json")}, "incomplete or of mismatched shapes"),
-        ({"metadata": _metadata(format=3)}, "format 3: allowed 1, 2"),
+        ({"metadata": _metadata(format=3)}, "format 3: allowed 2"),
         ({"metadata": _metadata(observation=["od"])}, "observation"),
         ({"actions": np.zeros(16)}, "17 Q values, 16 actions"),
         ({"b2": np.full(17, np.nan, np.float32)}, "not finite"),
@@ -136,19 +136,6 @@ def test_an_observation_beyond_the_limits_is_seen_at_them(tmp_path: Path) -> Non
     at = np.array([[1.0, 0.5], [-1.0, 0.9], [0.3, 0.1]])
     np.testing.assert_array_equal(read.q_values(beyond), _policy().q_values(at))
     assert (_policy().q_values(beyond) != _policy().q_values(at)).any()
-
-
-def test_a_file_of_the_first_format_is_read_without_limits(tmp_path: Path) -> None:
-    policy.save(tmp_path / "policy.npz", _policy())
-    with np.load(tmp_path / "policy.npz") as content:
-        arrays = {k: content[k] for k in content.files if not k.startswith("observation_")}
-    arrays["pump_rates"] = arrays.pop("actions")
-    arrays["metadata"] = _metadata(format=1)
-    np.savez(tmp_path / "old.npz", **arrays)
-    old = policy.load(tmp_path / "old.npz")
-    far = np.array([[3.0, 0.2], [0.01, 1.4]])
-    np.testing.assert_array_equal(old.q_values(far), _policy().q_values(far))
-    np.testing.assert_array_equal(old.actions, RATES)
 
 
 @pytest.mark.parametrize(

@@ -587,18 +587,6 @@ def test_the_shipped_policy_runs_on_a_device(tmp_path: Path, caplog: pytest.LogC
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_a_file_of_the_first_format_is_the_same_policy_and_so_is_its_copy(tmp_path: Path) -> None:
-    given = laws.law()
-    written(tmp_path / "policy.npz", given)
-    with np.load(tmp_path / "policy.npz") as content:
-        arrays = {name: content[name] for name in content.files if not name.startswith("observation")}
-    arrays["pump_rates"] = arrays.pop("actions")
-    arrays["metadata"] = np.array(json.dumps({**given.metadata, "format": 1}))
-    np.savez(tmp_path / "policy.npz", **arrays)
-    unpacked(tmp_path / "policy.npz", tmp_path / "run")
-    assert fingerprints(policy.load(tmp_path / "run" / "policy.npz")) == fingerprints(given)
-
-
 def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
     """tau 0.3 was found where the bench says 20 mL: the pump gives 10 % more; with 12 mL it is 0.3 * 12 / 20.
 

@@ -234,19 +234,6 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:
-    """Its journal does not tell of the hand-over, its state does."""
-    run = handed_over(tmp_path)
-    path = tmp_path / "journal.jsonl"
-    rows = [row for row in path.read_bytes().splitlines(keepends=True) if b'"kind":"regulate"' not in row]
-    path.write_bytes(b"".join(rows))
-    run.sound = True
-    run.begin()
-    assert not run.reactors.handed_over.any()
-    regulated_at(run)
-
-
-@pytest.mark.slow
 def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"
 

@@ -20,14 +20,11 @@ from experiments.control.bench_marks import BenchMarks
 from experiments.loop.loop import Step
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command
-from experiments.record.record import Record
-from experiments.record.recovery import COLUMNS
 from experiments.record.summary import figure_of, summarise
 from hardware.emulator.faults import inject
 from hardware.emulator.vial import DARK_COUNTS
 from hardware.errors import RecordingError
 from hardware.storage.marks import Mark, add_mark, read_marks
-from hardware.storage.recording_reader import read_recording
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import BLANK, quiet
 
@@ -76,23 +73,6 @@ def test_another_blank_afterwards_gives_what_the_device_would_have_shown(run: Re
     half = 1.833 / (2.0 * 0.226)
     ratio = np.sqrt(od / 0.226 + half**2) - half + np.log10(1.1)
     np.testing.assert_allclose(again, 1.833 * ratio + 0.226 * ratio**2, atol=1e-9)
-
-
-def test_a_recording_of_before_these_columns_is_read_and_resumed_from(run: Rehearsal, tmp_path: Path) -> None:
-    lines = (run.folder / "recordings" / "M0.csv").read_text().splitlines()
-    old = tmp_path / "old.csv"
-    old.write_text("".join(",".join(line.split(",")[:10]) + "\n" for line in lines))
-    assert old.read_text().splitlines()[0].split(",") == list(COLUMNS[:10])
-    np.testing.assert_array_equal(read_recording(old).od, read_recording(run.folder / "recordings" / "M0.csv").od)
-    rows = (run.folder / "journal.jsonl").read_text().splitlines()
-    for key in ("raw_counts", "blank_counts"):
-        rows = [json.dumps({**r, "row": {k: v for k, v in r["row"].items() if k != key}} if "row" in r else r)
-                for r in map(json.loads, rows)]  # fmt: skip
-    (tmp_path / "journal.jsonl").write_text("\n".join(rows) + "\n")
-    rebuilt = Record(tmp_path, ("M0",), fsync=False)
-    np.testing.assert_array_equal(rebuilt.series("od"), run.record.series("od"))
-    assert np.isnan(rebuilt.series("raw_counts")).all()
-    rebuilt.close()
 
 
 def test_a_reading_that_is_not_believed_counts_for_no_metric_and_is_a_cross_in_the_figure(tmp_path: Path) -> None:
