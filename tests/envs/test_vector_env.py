@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 import envs  # registers the environment
 from envs.gym_adapter import REGISTERED
@@ -71,21 +70,6 @@ def test_native_equals_gymnasiums_sync_step_for_step(overrides, mode):
             for i in np.flatnonzero(truncated):
                 np.testing.assert_array_equal(ia["final_obs"][i], ib["final_obs"][i])
     assert ends >= n
-
-
-def test_gymnasiums_stateful_wrappers_work():
-    """Observations normalised and episodes counted, both native and in Gymnasium's loop."""
-    native, sync = (
-        RecordEpisodeStatistics(NormalizeObservation(env)) for env in pair(4, AutoresetMode.NEXT_STEP, episode_steps=9)
-    )
-    rng = np.random.default_rng(1)
-    np.testing.assert_array_equal(native.reset(seed=3)[0], sync.reset(seed=3)[0])
-    for _ in range(45):
-        action = rng.integers(0, 17, 4)
-        for one, other in zip(native.step(action)[:4], sync.step(action)[:4], strict=True):
-            np.testing.assert_array_equal(one, other)
-    assert list(native.length_queue) == list(sync.length_queue) == [9] * 16
-    np.testing.assert_array_equal(native.return_queue, sync.return_queue)
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
@@ -175,23 +159,6 @@ def test_the_last_reward_of_an_episode_is_weighted_and_no_other():
         np.testing.assert_allclose(reward, -weight * (od - setpoint) ** 2, rtol=1e-12)
 
 
-def test_copies_follow_the_model_and_the_reward():
-    config = EnvConfig()
-    env = BioreactorVectorEnv(64, config)
-    observation, _ = env.reset(seed=0)
-    od, setpoint = env.od.copy(), env.setpoint.copy()
-    assert np.all((od >= 0.1) & (od <= 1.1))
-    assert set(np.round(setpoint, 3)) <= set(config.setpoints)
-    action = np.arange(64) % 17
-    observation, reward, terminated, truncated, _ = env.step(action)
-    expected = od * step_factors(config)[action]
-    np.testing.assert_allclose(env.od, expected, rtol=1e-15)
-    np.testing.assert_allclose(reward, -((expected - setpoint) ** 2))
-    np.testing.assert_allclose(observation[:, 0], expected, rtol=1e-6)
-    assert not terminated.any()
-    assert not truncated.any()
-
-
 def test_copies_may_have_seeds_of_their_own():
     """The third with none has a start that differs from time to time."""
     many, one = BioreactorVectorEnv(3), BioreactorVectorEnv(1)
@@ -217,17 +184,6 @@ def test_a_hundred_episodes_begin_each_in_its_own_way_and_continue_from_any_of_t
     assert len(np.unique(starts)) == 202
 
 
-def test_two_seeds_differ_and_one_seed_repeats():
-    first, second, third = (BioreactorVectorEnv(4) for _ in range(3))
-    a, _ = first.reset(seed=0)
-    b, _ = second.reset(seed=0)
-    c, _ = third.reset(seed=100)
-    np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(a, c)
-    d, _ = first.reset()
-    assert not np.array_equal(a, d)
-
-
 def test_starts_cover_their_ranges_evenly():
     env = BioreactorVectorEnv(4000)
     env.reset(seed=1)
@@ -237,6 +193,9 @@ def test_starts_cover_their_ranges_evenly():
     assert chi2 < 26.1  # 99.9 % quantile, 8 degrees of freedom
     assert abs(env.od.mean() - 0.6) < 0.02
     assert abs(np.corrcoef(env.od, env.setpoint)[0, 1]) < 0.06  # every OD with every setpoint
+    before = env.od.copy()
+    env.reset()  # without a seed it goes on with other starts
+    assert (env.od != before).mean() > 0.9
 
 
 def test_step_before_reset_is_refused():

@@ -421,43 +421,28 @@ def test_what_is_said_of_a_counted_share_is_that_reactors() -> None:
     assert doubtful
 
 
-def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_their_time() -> None:
-    """Two programs that begin 40 and 25 min into the run; counts with their 95 %; hours, and µL/s."""
+def test_a_change_is_announced_in_the_figure_once_its_time_has_come_and_a_recovery_has_no_setpoint() -> None:
+    """Two programs that begin 40 and 25 min into the run; a count before a beginning stands at its own time."""
     minutes = np.arange(0.0, 200.0, 2.0)
     began, rest = np.array([[40.0], [25.0]]), np.full((2, minutes.size), 0.4)
     elapsed = np.where(minutes >= began, minutes - began, np.nan)
     columns = {"time_min": np.tile(minutes, (2, 1)), "elapsed_min": elapsed, "believed": np.ones_like(rest)}
     columns |= dict.fromkeys(("ratio", "ratio_low", "ratio_high", "ratio_setpoint", "od", "setpoint"), rest)
-    columns |= {"temperature_degc": 80.0 * rest, "temperature_target_degc": 81.0 * rest, "fluorescence": 900.0 * rest}
-    columns["pump_rate_ml_s"], columns["phase"] = 0.01 * rest, np.where(np.isnan(elapsed), -1.0, 0.0)
-    marks = [Mark(60.0, "M1", "", None, 0.6, 0.05), Mark(90.0, "M0", "", 12.0), Mark(150.0, "M1", "", None, 0.3, 0.02)]
-    marks.append(Mark(20.0, "M0", "", None, 0.8, 0.01))
-    table = Table(("M0", "M1"), columns, [[], []], [], marks)
+    columns |= dict.fromkeys(("temperature_degc", "temperature_target_degc", "fluorescence", "pump_rate_ml_s"), rest)
+    columns["phase"] = np.where(np.isnan(elapsed), -1.0, 0.0)
+    marks = [Mark(60.0, "M1", "", None, 0.6, 0.05), Mark(90.0, "M0", "", 12.0), Mark(20.0, "M0", "", None, 0.8, 0.01)]
     phases = {"setpoints": (0.5, 0.5), "temperatures": (33.2, 33.2)}
     scenarios = [
         Scenario(**phases, minutes=(100.0, 60.0), ratios=(0.3, 0.7), announce_min=30.0),
         Scenario(**phases, minutes=(90.0, 60.0), ratios=(0.2, 0.5), announce_min=50.0),
     ]
-    share, heat, density, pump, light = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
-    assert share.get_ylabel() == "share of B. subtilis"
-    told = [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"]
-    assert told == [[[(70.0 + 40.0) / 60.0, 0.7]], [[(40.0 + 25.0) / 60.0, 0.5]]]
-    alone = figure_of(table, scenarios, "").axes[0]
-    for ax in (density, alone):  # while a culture recovers it has no setpoint
+    first, second = [110.0 / 60.0, 0.7], [65.0 / 60.0, 0.5]
+    for rows, told in ((41, [[], [second]]), (minutes.size, [[first], [second]])):  # to minute 80, and all
+        table = Table(("M0", "M1"), {key: values[:, :rows] for key, values in columns.items()}, [[], []], [], marks)
+        share, _, density, *_ = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
+        assert [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"] == told
+    for ax in (density, figure_of(table, scenarios, "").axes[0]):
         asked = [line.get_xydata() for line in ax.lines if line.get_linestyle() == "--"]
         assert [60.0 * xy[np.isfinite(xy[:, 1]), 0].min() for xy in asked] == pytest.approx([40.0, 26.0])
-    ended = {key: values[:, :34] for key, values in columns.items()}  # at minute 66, before the first one's
-    early = composition_figure_of(Table(("M0", "M1"), ended, [[], []], [], []), scenarios, "B. subtilis", "").axes[0]
-    told = [line.get_xydata().tolist() for line in early.lines if line.get_marker() == ">"]
-    assert told == [[], [[(40.0 + 25.0) / 60.0, 0.5]]]
-    drawn = [bar for bar in share.containers if len(bar.lines[0].get_xdata())]
-    assert [bar.lines[0].get_xydata().tolist() for bar in drawn] == [[[20 / 60, 0.8]], [[1.0, 0.6], [2.5, 0.3]]]
-    (segments,) = (line.get_segments() for line in drawn[1].lines[2])
-    np.testing.assert_allclose([s[1, 1] - s[0, 1] for s in segments], [3.92 * 0.05, 3.92 * 0.02])
-    labels = ["temperature, °C", "pump rate,\nµL/s", "fluorescence,\ncounts"]
-    assert [ax.get_ylabel() for ax in (heat, pump, light)] == labels
-    assert light.get_xlabel() == "time, h"
-    assert pump.lines[0].get_ydata().max() == pytest.approx(4.0)  # of 0.004 mL/s
-    assert heat.lines[0].get_ydata()[0] == 32.0
-    assert heat.lines[1].get_ydata()[0] == pytest.approx(32.4)
-    assert light.lines[0].get_xdata().max() == pytest.approx(198.0 / 60.0)
+    drawn = [bar.lines[0].get_xydata().tolist() for bar in share.containers if len(bar.lines[0].get_xdata())]
+    assert drawn == [[[20 / 60, 0.8]], [[1.0, 0.6]]]

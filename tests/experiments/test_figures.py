@@ -7,7 +7,6 @@ minutes, a spread of which sd and variance differ, intervals that are longer to 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from envs.identification.prediction_error import Estimate, Quality
 from envs.identification.screening import Screened, Series
 from envs.identification.twin import Course, Noise, Twin
 from envs.identification.validation import Validation
-from envs.relative import RelativeConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification.config import CertifyConfig
@@ -44,8 +42,6 @@ from experiments.reporting import calibration_charts, charts, composition_charts
 from experiments.reporting.agreement_chart import agreement_figure
 from experiments.reporting.pair_charts import pair_figure
 from experiments.training.coculture import Coculture
-from experiments.training.density import Density
-from experiments.training.relative import Relative
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 
@@ -218,17 +214,6 @@ def difference(metric: str, percent: float) -> dict[str, Any]:
     value = percent / 50.0
     between = {"difference": value, "ci95": [value - 0.1, value + 0.3], "verdict": "higher"}
     return {"controller": "pi", "plant": "p", "metric": metric, "percent": percent, **between}
-
-
-@cache
-def density() -> dict[str, Figure]:
-    """What a training on a plant that is looked at every 5 min draws."""
-    return Density(EnvConfig(control_min=5.0, episode_steps=6)).figures(laws.law())
-
-
-@cache
-def relative() -> dict[str, Figure]:
-    return Relative(RelativeConfig()).figures(laws.share_law())
 
 
 @cache
@@ -484,9 +469,6 @@ def test_what_holds_until_the_next_row_is_drawn_over_the_time_after_its_own() ->
     assert drawn_as(composition(), 3) == [after] * 2
     for method in ("prediction_error", "free_run"):
         assert drawn_as(fit(method), 2) == [after]
-    for panel in (3, 4, 5):
-        assert set(drawn_as(density()["trajectories"], panel)) == {after}
-        assert set(drawn_as(relative()["trajectories"], panel)) == {after}
     assert [drawn_as(episodes(), panel) for panel in (0, 1)] == [["steps-pre", "default", "default"], ["steps-pre"] * 2]
 
 
@@ -513,75 +495,6 @@ def test_the_temperature_of_equal_growth_is_where_both_curves_cross() -> None:
     growth = pair_figure(replace(PairConfig(), first=first), [[], []]).axes[0]
     assert growth.lines[-1].get_xdata() == pytest.approx([crossing] * 2, abs=2e-3)
     assert growth.get_legend().get_texts()[-1].get_text() == f"alike at {crossing:.2f} °C"
-
-
-def test_every_figure_of_the_program_is_among_these() -> None:
-    """What a module of figures offers, and what the rooms that draw call."""
-    here = Path(__file__).read_text(encoding="utf-8")
-    modules = [charts, calibration_charts, composition_charts, sweep_charts, figures]
-    drawing = {
-        n for m in modules for n in m.__all__ if getattr(getattr(m, n), "__annotations__", {}).get("return") is Figure
-    }
-    assert len(drawing) >= 17
-    assert not [n for n in drawing if f".{n}(" not in here and n not in THROUGH]
-
-
-THROUGH = {"closed_loop", "composition_figure", "policy_map", "trajectories", "relative_map", "relative_trajectories"}
-"""Drawn here through whoever calls them."""
-
-
-def test_a_map_of_a_policy_shows_its_rates_where_it_chooses_them() -> None:
-    axes = density()["policy_map"].axes
-    assert (label(axes[0], "x"), label(axes[0], "y"), axes[2].get_ylabel()) == ("OD x", "setpoint, OD", PUMP)
-    (mesh,) = (c for c in axes[0].collections if isinstance(c, QuadMesh))
-    edges, shown = mesh.get_coordinates(), np.asarray(mesh.get_array())
-    od, goal = (edges[0, :-1, 0] + edges[0, 1:, 0]) / 2, (edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2
-    assert (od[0], od[-1], goal[0], goal[-1]) == pytest.approx((0.05, 1.25, 0.2, 1.0))
-    policy = laws.law()
-    for i, k in ((0, 240), (16, 120), (32, 200), (5, 60)):
-        rate = policy.actions[int(policy.act(np.array([[od[k], goal[i]]]))[0])]
-        assert shown[i, k] == pytest.approx(1000.0 * rate)
-    assert {0.0, 20.0} <= set(shown.ravel())
-    assert mesh.get_clim() == (0.0, 20.0)
-    strong = charts.policy_map(od, goal, 2.0 * shown / 1000.0, shown / 1000.0).axes[0].collections[0]
-    assert strong.get_clim() == (0.0, 40.0)
-
-
-def test_example_loops_follow_the_model_by_what_their_axes_say() -> None:
-    """x' = x exp((mu - u / tau) min), with min and uL/s as they are drawn: of the policy, and of the optimum."""
-    axes = density()["trajectories"].axes
-    top, bottom = axes[0], axes[3]
-    assert (label(top, "x"), label(top, "y"), label(bottom, "y")) == (MIN, "OD", PUMP)
-    for k in (0, 1):
-        (minutes, od), (begins, rate) = read(top, f"line {1 + k}"), read(bottom, f"line {k}")
-        np.testing.assert_allclose(minutes, 5.0 * np.arange(7))
-        np.testing.assert_allclose(begins, minutes[:-1])
-        np.testing.assert_allclose(np.diff(np.log(od)), 5.0 * (0.03 - rate / 1000.0 / (1 / 3)), rtol=0.01, atol=1e-6)
-        assert rate.max() > 1.0
-
-
-def test_example_loops_in_relative_coordinates_follow_their_model() -> None:
-    """e' = e + s - v, with s in the title of the column."""
-    axes = relative()["trajectories"].axes
-    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[3], "y")) == (
-        "control periods", f"error e, {PERIODS}", "dose, share of full pump"
-    )  # fmt: skip
-    for column, share in enumerate((0.1, 0.5, 0.9)):
-        assert axes[column].get_title() == f"growth takes {share:g} of the pump"
-        (period, error), (_, dose) = read(axes[column], "line 0"), read(axes[3 + column], "line 0")
-        np.testing.assert_array_equal(period, np.arange(period.size))
-        k = min(error.size, dose.size) - 1
-        np.testing.assert_allclose(np.diff(error)[:k], share - dose[:k], atol=1e-6)
-    axes = relative()["policy_map"].axes
-    assert (label(axes[0], "x"), label(axes[0], "y"), axes[2].get_ylabel()) == (
-        f"error e, {PERIODS}", "growth's share of the pump, s", "dose, share of full pump"
-    )  # fmt: skip
-    (mesh,) = (c for c in axes[0].collections if isinstance(c, QuadMesh))
-    edges, shown = mesh.get_coordinates(), np.asarray(mesh.get_array())
-    error, share = (edges[0, :-1, 0] + edges[0, 1:, 0]) / 2, (edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2
-    inside = np.abs(error) < 1.0
-    law = np.clip(error[None, inside] + share[:, None], 0.0, 1.0)
-    np.testing.assert_allclose(shown[:, inside], law, atol=1 / 32 + 1e-6)  # the nearest of 17 levels
 
 
 @pytest.mark.slow
@@ -834,6 +747,7 @@ def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_fr
     od, best = np.array([[0.9, 0.5, 0.7]] * 3) * np.array([[1.0], [0.9], [0.8]]), np.array([[0.91, 0.51, 0.71]] * 3)
     rates, most = np.array([[0.001, 0.002, 0.003]] * 2), np.array([[0.01, 0.02, 0.03]] * 2)
     axes = charts.trajectories(minutes, od, best, goal, rates, most).axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == (MIN, "OD", PUMP)
     for column, (to, members) in enumerate(((0.4, (1,)), (0.8, (0, 2)))):
         top, bottom = axes[column], axes[2 + column]
         assert top.get_title() == f"setpoint {to:g}"
@@ -841,15 +755,20 @@ def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_fr
         for k, g in enumerate(members):
             own, other = top.lines[1 + 2 * k : 3 + 2 * k]
             assert own.get_label() == f"learned, from {od[0, g]:g}"
-            np.testing.assert_allclose(own.get_ydata(), od[:, g])
-            np.testing.assert_allclose(other.get_ydata(), best[:, g])
+            np.testing.assert_allclose(own.get_data(), [minutes, od[:, g]])
+            np.testing.assert_allclose(other.get_data(), [minutes, best[:, g]])
             assert other.get_linestyle() == ":"
             given, optimal = bottom.lines[2 * k : 2 * k + 2]
             assert given.get_color() == own.get_color()
-            np.testing.assert_allclose([given.get_ydata()[0], optimal.get_ydata()[0]], [g + 1.0, 10.0 * (g + 1.0)])
+            for line, rate in ((given, g + 1.0), (optimal, 10.0 * (g + 1.0))):
+                np.testing.assert_allclose(line.get_data(), [minutes[:-1], np.full(2, rate)])
+                assert line.get_drawstyle() == "steps-post"
         assert bottom.get_ylim()[1] > 30.0
     od, best, rates, most = (np.repeat(each, 20, axis=0) for each in (od, best, 10.0 * rates, 10.0 * most))
     axes = charts.relative_trajectories(od, best, np.array([0.9, 0.1, 0.9]), rates, most).axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == (
+        "control periods", f"error e, {PERIODS}", "dose, share of full pump"
+    )  # fmt: skip
     for column, (to, members) in enumerate(((0.1, (1,)), (0.9, (0, 2)))):
         assert axes[column].get_title() == f"growth takes {to:g} of the pump"
         for k, g in enumerate(members):
@@ -857,9 +776,10 @@ def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_fr
             assert own.get_label() == f"learned, from {od[0, g]:g}"
             np.testing.assert_allclose([own.get_ydata(), other.get_ydata()], [od[:40, g], best[:40, g]])
             given, optimal = axes[2 + column].lines[2 * k : 2 * k + 2]
-            np.testing.assert_allclose(
-                [given.get_ydata()[0], optimal.get_ydata()[0]], [0.01 * (g + 1.0), 0.1 * (g + 1.0)]
-            )
+            for line, level in ((given, 0.01 * (g + 1.0)), (optimal, 0.1 * (g + 1.0))):
+                np.testing.assert_allclose(line.get_data(), [np.arange(40), np.full(40, level)])
+                assert line.get_drawstyle() == "steps-post"
+            assert own.get_xdata().tolist() == other.get_xdata().tolist() == [*range(40)]
 
 
 def test_curves_of_several_seeds_say_how_many_they_are_and_one_where_its_policy_was_kept() -> None:
@@ -885,15 +805,21 @@ def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale
     """The optimum pumps up to 30 uL/s, and the learned policy never at all."""
     x, y = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5])
     none, most = np.zeros((2, 3)), np.array([[0.0, 0.01, 0.02], [0.01, 0.02, 0.03]])
-    for drawn, scale, end in (
-        (charts.policy_map(x, y, none, most), 1000.0, 30.0),
-        (charts.relative_map(x, y, none, most), 1.0, 1.0),
-    ):
+    for drawn, scale, end, *said in (
+        (charts.policy_map(x, y, none, most), 1000.0, 30.0, "OD x", "setpoint, OD", PUMP),
+        (charts.policy_map(x, y, none, most / 2.0), 500.0, 20.0, "OD x", "setpoint, OD", PUMP),
+        (charts.relative_map(x, y, none, most), 1.0, 1.0, f"error e, {PERIODS}", "growth's share of the pump, s",
+         "dose, share of full pump"),
+    ):  # fmt: skip
+        assert [label(drawn.axes[0], "x"), label(drawn.axes[0], "y"), drawn.axes[2].get_ylabel()] == said
         for ax, title, rates in zip(
             drawn.axes, ("learned policy", "optimum (dynamic programming)"), (none, most), strict=False
         ):
             (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
             assert ax.get_title() == title
+            edges = mesh.get_coordinates()
+            np.testing.assert_allclose((edges[0, :-1, 0] + edges[0, 1:, 0]) / 2.0, x)
+            np.testing.assert_allclose((edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2.0, y)
             np.testing.assert_allclose(np.asarray(mesh.get_array()), scale * rates)
             assert mesh.get_clim() == (0.0, end)
 

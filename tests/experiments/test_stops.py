@@ -1,7 +1,6 @@
 """Ctrl-C, SIGTERM and SIGHUP end a command with one line that says what it keeps: real processes, real signals."""
 
 import contextlib
-import json
 import os
 import re
 import shlex
@@ -24,7 +23,6 @@ from experiments.training.session import Session
 from tests import programs
 from tests.patience import PATIENCE_S
 from tests.programs import Program
-from tests.studies.ablate import AblateConfig, _read
 
 BLANK = {"WITHOUT_FIGURES": "1"}
 SHORT = ["agent=paper", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200"]
@@ -257,34 +255,14 @@ def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -> None:
-    run = Run(tmp_path, "tests.studies.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
-    run.until_there("study/tuned/progress.csv", lines=2)
-    run.ctrl_c()
-    line = run.stopped()
-    before = (tmp_path / "study/tuned/progress.csv").read_text().splitlines()
-    assert all(int(row.split(",")[0]) < 1000 for row in before[1:])
-    go_on(run, line)
-    assert (tmp_path / "study/tuned/progress.csv").read_text().splitlines()[: len(before)] == before
-    config = frame.load(frame.compose("ablate", [*SHORT, "only=[tuned]", "n_agents=2"]), AblateConfig())
-    (tmp_path / "whole").mkdir()
-    whole = Session(config.training("tuned"), tmp_path / "whole")
-    whole.run()
-    whole.writer.close()
-    assert [row.regret_pct for row in _read(tmp_path / "study/ablation.csv")] == whole.report()[1].regret_pct.tolist()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "there", "kept"),
     [
-        (["tests.studies.degradation", "n_agents=1", "agent.total_steps=100"], "curves.csv", "curves.csv"),
         (
             ["tests.campaigns.soak"],
             "state.json",
             "certificate.json, journal.jsonl, policy.npz, recordings/, state.json",
         ),
-        (["tests.studies.speed"], "config.yaml", "no result"),
         (["experiments.calibrate", "coverage=1000"], "config.yaml", "no result"),
         (["tests.campaigns.faults", "workers=2"], "faults.log", "cases.csv"),  # the first case is logged
     ],
@@ -294,15 +272,6 @@ def test_a_stopped_command_says_what_it_keeps(words: list[str], there: str, kept
     run.until_there(f"run/{there}")
     run.ctrl_c()
     assert run.stopped() == f"stopped; run keeps {kept}; to try again, start anew"
-
-
-@pytest.mark.slow
-def test_a_stopped_kill_campaign_leaves_neither_clients_nor_emulators(tmp_path: Path) -> None:
-    run = Run(tmp_path, "tests.campaigns.kills", "kills=4", "runs=2", "longest_s=60", "hydra.run.dir=run")
-    run.until_there("run/run0/journal.jsonl")
-    run.ctrl_c()
-    assert "run keeps calibration/, ended_runs.json, run0.log, run0/" in run.stopped()
-    assert json.loads((tmp_path / "run/ended_runs.json").read_text()) == {"runs": []}
 
 
 @pytest.mark.slow

@@ -140,40 +140,6 @@ def test_every_curve_and_figure_says_what_it_is(runs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_curves_of_a_deployment_are_its_recording_over_minutes(runs: Path) -> None:
-    """Several reactors: a run each, with the same tags, so that they can be laid over each other.
-
-    A sample every 2 min; of what the law proposed, the interlock let 3 mL through.
-    """
-    for name in ("M0", "M1"):
-        (events,) = parts(runs / "pi" / "reactors" / name)
-        recorded = read_recording(runs / "pi" / "recordings" / f"{name}.csv")
-        step, od = curve(events, "culture/od").T
-        np.testing.assert_allclose(od, recorded.od, rtol=1e-6)
-        assert step.tolist() == recorded.time_min.tolist() == list(range(0, 2 * step.size, 2))
-        rate = curve(events, "pump/rate_ml_s")[:, 1]
-        np.testing.assert_allclose(rate, recorded.pump_rate, rtol=1e-6)
-        with open(runs / "pi" / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as f:
-            proposed = np.array([float(row["proposed_ml_s"]) for row in csv.DictReader(f)])
-        assert 0.0 < 120.0 * rate.sum() <= 3.0 < 120.0 * proposed.sum()
-        for edge, factor in (("low", 0.95), ("high", 1.05)):
-            asked = curve(events, f"culture/setpoint_{edge}")
-            assert set(asked[:, 1]) == {np.float32(0.45 * factor)}
-            assert asked[0, 0] == step[od >= 0.44][0] > 1  # from the end of the recovery on
-    (events,) = parts(runs / "dqn")
-    assert len(curve(events, "culture/od")) == len(read_recording(runs / "dqn" / "recordings" / "M0.csv").od)
-
-
-@pytest.mark.slow
-def test_points_are_dated_by_the_minute_of_the_culture(runs: Path) -> None:
-    """12 min of culture that took a second: TensorBoard's relative axis shows them as 12 min."""
-    for where, minutes in ((runs / "dqn", 1.0), (runs / "pi" / "reactors" / "M1", 2.0)):
-        (events,) = parts(where)
-        wall = np.array([e.wall_time for e in events.Tensors("culture/od")])
-        np.testing.assert_allclose(np.diff(wall), 60.0 * minutes, atol=1e-3)
-
-
-@pytest.mark.slow
 def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
     """Learning with its limits; OD with the setpoint's band; share with its band."""
     for name, titles in (

@@ -16,7 +16,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from conf import presets
 from dqn import checkpoint, policy
@@ -78,20 +77,6 @@ def test_a_run_leaves_a_summary_and_every_file(whole):
     files = ("config.yaml", "progress.csv", "checkpoint.pt", "policy.npz")
     for name in (*files, "policies/seed0002.npz", "policies/seed0003.npz", *figures):
         assert (whole / name).is_file(), name
-
-
-@pytest.mark.slow
-def test_tensorboard_reads_grouped_scalars_and_figures(whole):
-    events = EventAccumulator(str(whole)).Reload()
-    tags = set(events.Tags()["tensors"])
-    for tag in ("train/return", "train/loss", "q/min", "q/max", "eval/regret_pct", "eval/steady_abs_error"):
-        assert {f"{tag}/iqm", f"{tag}/min", f"{tag}/max"} <= tags
-    assert {"train/epsilon", "speed/steps_per_s"} <= tags
-    for name in ("learning", "policy_map", "trajectories"):  # drawn once: TensorBoard has the PNG of the folder
-        (image,) = events.Tensors(f"figures/{name}")
-        assert image.tensor_proto.string_val[2] == (whole / "figures" / f"{name}.png").read_bytes()
-    single = EventAccumulator(str(whole / "agents" / "seed0003")).Reload()
-    assert [e.step for e in single.Tensors("train/return")] == list(range(100, 501, 100))
 
 
 @pytest.mark.slow
