@@ -197,35 +197,12 @@ def test_points_carry_the_average_at_any_length(law: str, hours: float) -> None:
         assert moved < 0.25 * first.inverse_tau.half_width
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stirring", [20.0, 60.0])
-def test_a_vial_that_mixes_slowly_moves_nothing(stirring: float) -> None:
-    """The sensor sees what first-order mixing has brought to it, simulated here in steps of a second."""
-    rng, found = np.random.default_rng(8), []
-    for _ in range(8):
-        od, bulk, seen, rate = [], 0.5, 0.5, []
-        for _ in range(361):
-            od.append(seen * (1.0 + 0.01 * rng.standard_normal()))
-            rate.append(0.02 if od[-1] > 0.5 else 0.0)
-            bulk *= np.exp(-rate[-1] / TAU * (1.0 + 0.1 * rng.standard_normal()))
-            for _second in range(60):
-                bulk, seen = bulk * np.exp(MU / 60.0), seen * np.exp(MU / 60.0) + (bulk - seen) / stirring
-        found += estimate([Series(np.arange(361.0), np.array(od), np.array(rate), np.arange(361))])
-    assert ratios(found) == pytest.approx((1.0, 1.0), abs=0.08)
-    assert sum(e.inverse_tau.low <= 1.0 / TAU <= e.inverse_tau.high for e in found) >= 7
-
-
 def test_series_in_one_batch_are_independent() -> None:
     parts = [s.part(0, 200 - 37 * i) for i, s in enumerate(regulated(3))]
     together, alone = estimate(parts), [estimate([p])[0] for p in parts]
     for a, b in zip(together, alone, strict=True):
         assert (a.mu.value, a.inverse_tau.low) == pytest.approx((b.mu.value, b.inverse_tau.low), rel=1e-9)
         np.testing.assert_allclose(a.innovation, b.innovation, rtol=1e-7, atol=1e-9)
-
-
-def test_noise_free_recording_gives_its_parameters_back() -> None:
-    found = estimate(regulated(1, noise=1e-6))[0]
-    assert (found.mu.value, 1.0 / found.inverse_tau.value) == pytest.approx((MU, TAU), rel=1e-3)
 
 
 # ---------------------------------------------------------------- feedback and disturbances

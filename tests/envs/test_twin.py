@@ -109,24 +109,6 @@ def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
     assert pmse(result.screened.series.od, seen) < 1.0
 
 
-@each_law
-def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
-    time, od, rate = record(TRUTH, law, 2)
-    _, first = found(time, od[0], rate[0])
-    _, od_again, rate_again = record(plant_of(first), law, 52)
-    for a, b in ((od, od_again), (1000.0 * rate, 1000.0 * rate_again)):
-        for before, after in zip(np.array_split(a[0], 3), np.array_split(b[0], 3), strict=True):
-            assert after.mean() == pytest.approx(before.mean(), rel=0.03)
-            assert after.std() == pytest.approx(before.std(), rel=0.3)
-    _, again = found(time, od_again[0], rate_again[0])
-    np.testing.assert_allclose(again.mu.value, first.mu.value, rtol=0.1)
-    np.testing.assert_allclose(again.tau.value, first.tau.value, rtol=0.1)
-    ratio = np.hypot(again.noise.floor, again.noise.relative / 2) / np.hypot(
-        first.noise.floor, first.noise.relative / 2
-    )
-    assert ratio == pytest.approx(1.0, abs=0.25)
-
-
 @pytest.mark.slow
 def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
     time, od, rate = record(TRUTH, "threshold", 1)

@@ -22,12 +22,6 @@ def test_gymnasium_checks_the_single_environment():
     check_env(gymnasium.make(ID).unwrapped)
 
 
-@pytest.mark.slow
-def test_stable_baselines_checks_the_single_environment():
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the extra [bench]")
-    checker.check_env(gymnasium.make(ID).unwrapped, warn=True)
-
-
 def test_make_vec_gives_the_native_environment():
     env = gymnasium.make_vec(ID, num_envs=3)
     assert isinstance(env.unwrapped, BioreactorVectorEnv)

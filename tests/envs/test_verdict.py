@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
 from envs.identification.drift import Drift, Segment, cuts, drift
 from envs.identification.model import NotIdentifiable, Parameter
-from envs.identification.open_loop import OpenLoop
 from envs.identification.refusal import check_estimate, growth_alone
 from envs.identification.screening import Series, merged
 from envs.identification.validation import Validation, attainable_pct
 from envs.identification.verdict import judged
-from experiments.calibration.study import against_truth
 from tests.studies.second_simulator import Conditions, simulate
 
 pytestmark = pytest.mark.numeric
@@ -383,31 +381,3 @@ def test_seed_of_the_average_is_a_setting() -> None:
     assert again.tau == good().tau
     assert other.tau != again.tau
     assert other.tau.value == pytest.approx(again.tau.value, abs=0.25 * again.tau.half_width)
-
-
-@pytest.mark.slow
-def test_protocol_of_the_first_simulator_is_the_second_ones() -> None:
-    """Two simulators of one law that share no code: the same estimate on average."""
-    from experiments.calibration.config import CalibrateConfig
-    from experiments.calibration.study import simulated
-
-    config = CalibrateConfig(protocol=OpenLoop(mu=0.03, tau=1 / 3, dose_cv=0.1, growth_cv=0.05, seed=2))
-    time, od, rate, _ = simulated(config, 8)
-    first = [calibrate(Series(time, od[i], rate[i], np.arange(len(time)))) for i in range(8)]
-    r = simulate(Conditions(law="open_loop"), 8, 2)
-    second = [calibrate(Series(r.time, r.od[i], r.pump_rate[i], np.arange(len(r.time)))) for i in range(8)]
-    for found in (first, second):
-        assert np.mean([c.tau.value for c in found]) == pytest.approx(1 / 3, rel=0.03)
-    widths = [float(np.median([c.tau.half_width for c in found])) for found in (first, second)]
-    assert widths[0] == pytest.approx(widths[1], rel=0.35)
-
-
-def test_a_refused_recording_shifts_no_truth() -> None:
-    found = ["no tau", good()]
-    growth = np.array([0.5, good().mu.value])
-    numbers = against_truth(found, growth, np.array([0.1, good().tau.value]))
-    assert (numbers["refused"], numbers["wrong_pct"]) == (1, 0.0)
-    assert numbers["coverage_pct"] == {"mu": 100.0, "tau": 100.0}
-    assert numbers["median_bias_pct"] == pytest.approx({"mu": 0.0, "tau": 0.0})
-    far = against_truth(found, 1.5 * growth, np.array([0.1, good().tau.value]))
-    assert far["wrong_pct"] == 50.0

@@ -80,19 +80,6 @@ def test_model_based_controllers_reach_the_oracle_where_their_model_is_true(cont
         assert bound * (1.0 - 5e-5) <= total(trial(controller, "nominal", scenario, 1), "ise") <= bound * 1.02
 
 
-@pytest.mark.slow
-def test_oracle_knows_each_vial_and_gains_by_it():
-    """Noise-free ITAE on `bench`, where every vial is another; `adaptive_inverse` learns them and comes nearest."""
-    best = total_clean("oracle")
-    for controller in FEEDBACK:
-        assert total_clean(controller) > 1.2 * best
-
-
-def total_clean(controller: str) -> float:
-    t = trial(controller, "bench", "setpoint_steps", 6)
-    return float(sum(t.score(w, "clean").itae.mean() for w in windows(t.schedule)))
-
-
 def test_oracle_is_the_dynamic_programme_of_the_training_model():
     """On `nominal` its closed loop is that of envs.optimum with the same levels, setpoint by setpoint."""
     from envs.optimum import solve

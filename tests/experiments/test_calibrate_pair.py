@@ -148,19 +148,6 @@ def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], 
     assert even[False] == pytest.approx(TRUE.even_c, abs=0.15)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [1, -1])
-def test_the_lag_of_growth_biases_nothing_whichever_way_the_temperature_goes(order: int, tmp_path: Path) -> None:
-    steps = dict(list({27.5: 6.0, 31.0: 5.5, 34.5: 5.5}.items())[::order])
-    for name, share, seed in (("a", 0.0, 0), ("b", 1.0, 1)):
-        recorded(tmp_path / f"{name}.csv", share, steps, seed=seed)
-    calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=1.0), tmp_path)
-    pair = named_pair(str(tmp_path / "pair.yaml"))
-    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.1)
-    t = np.array([28.0, 31.0, 34.0])
-    np.testing.assert_allclose(pair.rates(t)[:, 1], TRUE.rates(t)[:, 1], rtol=0.03)
-
-
 def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorded(tmp_path / "a.csv", 0.0, {27.5: 4.0, 29.0: 2.5, 31.0: 3.6, 34.5: 3.6})
     with pytest.raises(frame.UserError, match=r"none\.csv"):

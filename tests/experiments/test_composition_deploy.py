@@ -92,16 +92,6 @@ def test_the_summary_has_the_errors_of_every_window(deployed: Path) -> None:
 
 
 @shared
-def test_the_share_goes_where_it_is_asked_to(deployed: Path) -> None:
-    true, minute = column(deployed, "true_ratio"), column(deployed, "elapsed_min")
-    assert true[0] == 0.5
-    assert true[minute == 170.0] == pytest.approx(0.3, abs=0.03)
-    assert true[minute == 350.0] > 0.45
-    assert np.abs(column(deployed, "ratio") - true)[60:].max() < 0.1
-    assert np.abs(column(deployed, "od") - 0.5).max() < 0.05
-
-
-@shared
 def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
     picture = (deployed / "figures" / "composition.svg").read_text()
     for word in ("share of P. putida", "truth", "thermostat", "fluorescence,", "M1, estimate"):

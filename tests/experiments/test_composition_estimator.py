@@ -121,10 +121,8 @@ def test_it_is_the_dense_solution_where_everything_is_nearly_linear():
     np.testing.assert_allclose(found, exact, rtol=0.15, atol=0.02 * np.diag(exact).max())
 
 
-def closed_loop(plant_name, calibrated, n=32, flow=1.0):
-    config = build(PlantConfig(), presets.load(f"plant/{plant_name}"))
-    config = replace(config, pump=replace(config.pump, gain_ml_s=flow))
-    plant = Plant(config, n, np.random.default_rng(0))
+def closed_loop(plant_name, calibrated, n=32):
+    plant = Plant(build(PlantConfig(), presets.load(f"plant/{plant_name}")), n, np.random.default_rng(0))
     config = registry.config("proportional", registry.SHARE)
     estimator, law = CompositionEstimator(config.estimator), registry.build(config, registry.SHARE)
     estimator.reset(n)
@@ -133,8 +131,7 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
         calibrate(estimator, plant, seed=0)
     density = registry.build(registry.config("inverse"), model=EnvConfig())
     program = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
-    found = run_share(plant, estimator, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
-    return found, estimator
+    return run_share(plant, estimator, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
 
 
 @pytest.mark.slow
@@ -148,28 +145,11 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
 )
 def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, rms):
     """Where the sensor is not calibrated its constants are drawn from a range that ends within two sds: more often."""
-    found, _ = closed_loop(plant, calibrated)
+    found = closed_loop(plant, calibrated)
     after = slice(60, None)  # the first guess is the plant's own start here, which is no merit
     inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
     assert 0.9 <= inside[:, after].mean() <= most
     assert np.sqrt(np.square(found["estimate"] - found["share"])[:, after].mean()) < rms
-
-
-@pytest.mark.slow
-def test_errors_of_both_growth_curves_are_found():
-    _, estimator = closed_loop("coculture_growth_both", calibrated=True, n=8)
-    told = estimator.explain()
-    np.testing.assert_allclose(told["bias_e"].mean(), -0.05, atol=0.02)
-    np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.02)
-
-
-@pytest.mark.slow
-def test_a_pump_that_gives_a_tenth_less_is_found_and_does_not_mislead():
-    found, estimator = closed_loop("coculture", calibrated=True, flow=0.9)
-    np.testing.assert_allclose(estimator.explain()["dose_gain"].mean(), 0.9, atol=0.02)
-    inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
-    assert inside[:, 60:].mean() >= 0.9
-    assert np.sqrt(np.square(found["estimate"] - found["share"])[:, 60:].mean()) < 0.02
 
 
 def test_what_is_considered_never_moves_and_always_counts():

@@ -169,14 +169,6 @@ def test_nothing_beats_the_optimum_over_the_program_and_foresight_pays():
     assert blind > 1.5 * best
 
 
-@pytest.mark.slow
-def test_a_sine_is_followed_better_when_it_is_told_ahead():
-    sine = Program((), (1200.0,), (0.5, 0.4, 1200.0))
-    for kind in ("midpoint", "receding"):
-        told, blind = (error(on_the_model(kind, sine, announce_min=m), sine) for m in (360.0, 0.0))
-        assert told < 0.75 * blind
-
-
 def test_every_law_goes_on_to_the_bit_from_what_it_saved():
     for kind in ("pi", "midpoint", "myopic", "optimum"):
         whole, second = law(kind), law(kind)

@@ -16,9 +16,7 @@ from matplotlib.collections import LineCollection, PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from dqn.policy import load
 from envs.coculture.pair import PairConfig
-from envs.coculture.task import CocultureConfig
 from envs.identification.agreement import Agreement, Compared
 from envs.identification.curves import Plateau
 from envs.identification.drift import Drift, Segment
@@ -35,13 +33,11 @@ from experiments.certification.figure import figure as certificate_figure
 from experiments.certification.judge import Certificate, certify
 from experiments.comparison import figures
 from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
-from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.record.record import Table
 from experiments.record.summary import composition_figure_of, figure_of
 from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
 from experiments.reporting.agreement_chart import agreement_figure
 from experiments.reporting.pair_charts import pair_figure
-from experiments.training.coculture import Coculture
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 
@@ -495,19 +491,6 @@ def test_the_temperature_of_equal_growth_is_where_both_curves_cross() -> None:
     growth = pair_figure(replace(PairConfig(), first=first), [[], []]).axes[0]
     assert growth.lines[-1].get_xdata() == pytest.approx([crossing] * 2, abs=2e-3)
     assert growth.get_legend().get_texts()[-1].get_text() == f"alike at {crossing:.2f} °C"
-
-
-@pytest.mark.slow
-def test_example_episodes_of_a_share_are_as_long_as_they_say() -> None:
-    """Twelve decisions of 10 min, each of one of 17 temperatures from 29 to 36 degC."""
-    task, shipped = Coculture(CocultureConfig(episode_steps=12)), load(SHIPPED_COMPOSITION["dqn"])
-    axes = task.figures(shipped)["trajectories"].axes
-    hours, chosen = read(axes[6], "line 0")
-    np.testing.assert_allclose(hours, np.arange(1, 13) / 6.0)
-    assert set(chosen) <= set(np.linspace(29.0, 36.0, 17))
-    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[6], "y")) == (
-        "hours", "share of P. putida", "thermostat, °C"
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])

@@ -99,18 +99,14 @@ def test_setpoints_of_a_single_reactor_are_judged_as_those_of_all(reactor: str, 
     assert assemble.unpack(deployed(tmp_path, {}, backend=devices, each=within), tmp_path).policy is not None
 
 
-def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assemble.unpack(deployed(tmp_path, {}, backend=ChiBioConfig()), tmp_path)
-    assemble.unpack(deployed(tmp_path, {"regret_pct": 30.0}, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
-
-
 def test_a_policy_is_sound_at_the_very_ends_of_what_is_allowed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its regret is as large as may be, and the scenario asks for its lowest and highest setpoint."""
+    """Its regret is as large as may be, also by a limit of one's own; asked for are its lowest and highest setpoint."""
     edge = {"regret_pct": 10.0, "model": {"setpoints": [0.8, 0.65, 0.5]}, "updates": 1}
     assemble.unpack(deployed(tmp_path, edge, backend=ChiBioConfig()), tmp_path)
+    own = edge | {"regret_pct": 40.0}
+    assemble.unpack(deployed(tmp_path, own, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
