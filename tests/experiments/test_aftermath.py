@@ -82,34 +82,6 @@ def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
 
 
 @pytest.mark.slow
-def test_the_controllers_own_estimates_are_read_from_the_journal(drifting):
-    why = decisions(drifting, "M0")
-    assert set(why) == {"minute", "mu", "gain"}
-    with open(drifting / "recordings" / "M0.csv", newline="") as f:
-        minutes = [float(row["time_min"]) for row in csv.DictReader(f)]
-    np.testing.assert_array_equal(why["minute"], minutes)
-    lines = [json.loads(line) for line in (drifting / "journal.jsonl").read_text().splitlines()]
-    mine = [r["why"]["mu"] for r in lines if r["kind"] == "decision" and r["reactor"] == "M0"]
-    np.testing.assert_array_equal(why["mu"], mine)
-    assert why["mu"][-1] > 1.1 * why["mu"][0]
-
-
-@pytest.mark.slow
-def test_rows_on_which_a_supervisor_acted_are_counted(copy):
-    """As its explanation says, 0 or 1 beside the others; a row without it counts as none."""
-    lines = (copy / "journal.jsonl").read_text().splitlines()
-    rows = [json.loads(line) for line in lines]
-    for row in rows:
-        if row["kind"] == "decision" and row["reactor"] == "M1" and row["row"]["time_min"] >= 50:
-            row["why"]["supervised"] = float(100 <= row["row"]["time_min"] < 140)
-    torn = '{"n":99,"kind":"decision","reactor":"M1","ro'
-    (copy / "journal.jsonl").write_text("\n".join([*map(json.dumps, rows), torn]).replace(": ", ":").replace(", ", ","))
-    text = sections(copy)
-    assert text.count("A supervisor acted on 0 rows.") == 1
-    assert text.count("A supervisor acted on 40 rows, minute 100 to 139.") == 1
-
-
-@pytest.mark.slow
 def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, tmp_path):
     fitted = tmp_path / "calibrated.yaml"
     fitted.write_text("mu: 0.03\ntau: 0.3333\n")
@@ -123,17 +95,6 @@ def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, t
     own = inverse_policy()
     policies.save(copy / "policy.npz", replace(own, metadata={**own.metadata, "model": {"mu": 0.03, "tau": 0.3333}}))
     assert sections(copy).count("Recalibrate: ") == 2
-
-
-@pytest.mark.slow
-def test_what_the_interlock_did_stands_beside_it(copy):
-    summary = json.loads((copy / "summary.json").read_text())
-    summary["reactors"]["M0"] |= {
-        "interlock": 7, "reasons": {"stale": {"rows": 7, "first_min": 31.0, "last_min": 40.0}},
-    }  # fmt: skip
-    (copy / "summary.json").write_text(json.dumps(summary))
-    rows = summary["reactors"]["M0"]["rows"]
-    assert f"The interlock spoke in 7 of {rows} rows: stale in 7 rows, minute 31 to 40." in sections(copy)
 
 
 @pytest.mark.slow

@@ -27,15 +27,6 @@ def error(folder: Path, *words: str) -> dict[str, float]:
     return {w["reactor"]: w["steady_abs_error"] for w in windows}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["inverse", "pi_tuned", "dqn"])
-def test_a_law_of_one_volume_decides_for_every_volume(law: str, tmp_path: Path) -> None:
-    vials = ["plant=nominal_noise", "backend.reactors=[M0,M1,M2]", f"controller={law}"]
-    found = error(tmp_path / "each", *vials, "bench.volumes_ml.M1=9", "bench.volumes_ml.M2=31")
-    usual = error(tmp_path / "all", *vials)
-    assert max(found.values()) < 1.5 * max(usual.values())
-
-
 def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> None:
     """The law that only balances growth learns nothing: scaled wrongly it lets the culture go."""
     words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=hold", "plant.start_od=0.6"]

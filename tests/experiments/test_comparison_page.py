@@ -430,27 +430,3 @@ def test_a_page_says_how_much_was_run_and_has_the_words_of_its_own_signal(tmp_pa
     assert said["items"] == ["steps on one: pi 0.03, then midpoint 0.04"]
     [(_, words)] = sections["Definitions"]
     assert [term for term, _ in words["pairs"]] == list(page.SHARE)
-
-
-def test_every_further_measure_of_a_plant_stands_under_its_own_title_and_law() -> None:
-    """No two values are alike; plants down, laws across, and of some measures none is the best."""
-    keys = ("itae_median", "clean_ise", "clean_itae", "clean_steady_abs_error", "effort_ul_s", "media_ml", "held")
-    totals = [
-        entry(plant, law, 0.004) | {key: 100.0 * i + 10.0 * k + j for k, key in enumerate(keys, 1)}
-        for i, plant in enumerate(("nominal", "bench"))
-        for j, law in enumerate(("pi", "mpc"), 1)
-    ]
-    out = section()
-    page.every_plant(out, {"totals": totals, "paired_totals": []}, "day")
-    found = {t.title: [tuple(map(str, row)) for row in t.rows] for t in out.tables if t.note == "Mean, n = 4."}
-    titles = (
-        "ITAE of the measured OD (OD min²), sum over the windows, median over vials",
-        "ISE of the noise-free OD (OD² min), sum over the windows",
-        "ITAE of the noise-free OD (OD min²), sum over the windows", "Steady error of the noise-free OD",
-        "Control effort (µL/s per decision)", "Fresh medium used (mL per vial)",
-        "Samples on which the interlock allowed no dose, per vial",
-    )  # fmt: skip
-    assert found == {
-        title: [("nominal", f"{k}1", f"{k}2"), ("bench", f"1{k}1", f"1{k}2")] for k, title in enumerate(titles, 1)
-    }
-    assert {table.columns[:3] for table in out.tables} == {("plant", "pi", "mpc")}

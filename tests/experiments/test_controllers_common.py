@@ -187,15 +187,6 @@ def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
         registry.config("mine")
 
 
-def test_two_volumes_two_gains_of_the_devices_law() -> None:
-    """0.7 ln(x / r) / (240 / V): a vial of 10 mL gets half of what one of 20 mL gets, in whatever order they are."""
-    device = registry.build(registry.config("pi"), volume_ml=np.array([10.0, 20.0, 15.0]))
-    device.reset(3)
-    for minute in range(3):
-        device.act(np.full(3, 0.52), np.full(3, 0.5), np.full(3, float(minute)), np.ones(3, dtype=bool))
-    np.testing.assert_allclose(device.explain()["p"], 0.7 * np.log(1.04) * np.array([10.0, 20.0, 15.0]) / 240.0)
-
-
 def test_a_policy_of_the_od_says_how_sure_it_is_of_each_vial() -> None:
     """Q is (OD, setpoint, 0.25). The second vial has no reading, the third is not asked this time."""
     none = np.zeros(2, np.float32)

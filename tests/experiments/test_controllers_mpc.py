@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envs.optimum import solve
 from envs.task import EnvConfig, step_factors
 from experiments.laws.density.mpc import Mpc, MpcConfig, Problem
 from experiments.laws.density.pso import SwarmConfig, minimise
@@ -106,25 +105,6 @@ def test_swarm_minimises_what_it_is_given() -> None:
     best, cost = minimise(bowl, 0.0, 1.0, np.zeros((2, 3)), np.random.default_rng(0).spawn(2), swarm)
     np.testing.assert_allclose(best, centre, atol=1e-6)
     np.testing.assert_allclose(cost, bowl(best[:, None])[:, 0])
-
-
-@pytest.mark.parametrize("solver", ["pso", "gradient"])
-def test_closed_loop_on_the_model_costs_what_the_optimum_costs(solver: str) -> None:
-    """Sum over 40 steps of (x - r)^2 after each step, against the dynamic-programming policy with its 17 rates."""
-    n = 6
-    od, setpoint = states(n, seed=4)
-    mpc, optimum = Mpc(MpcConfig(solver=solver), MODEL), solve(MODEL, grid=3001)
-    mpc.reset(n)
-    ours, best = od.copy(), od.copy()
-    j_ours, j_best = np.zeros(n), np.zeros(n)
-    for k in range(40):
-        u = mpc.act(ours, setpoint, np.full(n, float(k)), np.ones(n, dtype=bool))
-        ours = ours * step_factors(MODEL, u)
-        best = best * optimum.factors[optimum.act(best, setpoint)]
-        j_ours += (ours - setpoint) ** 2
-        j_best += (best - setpoint) ** 2
-    assert j_ours.mean() == pytest.approx(j_best.mean(), rel=0.02)
-    assert np.abs(ours - setpoint).max() < 1e-3
 
 
 def test_decisions_repeat_and_seeds_matter() -> None:

@@ -5,7 +5,7 @@ import errno
 import json
 import os
 import subprocess
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,9 +29,6 @@ from experiments.laws import registry
 from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
 from experiments.record.curves import Curves
-from experiments.record.record import Record
-from experiments.record.summary import ChangeLog
-from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
 from hardware.family import family_of
@@ -91,36 +88,28 @@ def deployed(policy_file, tmp_path_factory):
     return folder / "run"
 
 
-def test_summary_has_its_keys_and_holds_the_setpoints(deployed):
+def test_summary_and_recording_tell_the_whole_run(deployed):
     summary = json.loads((deployed / "summary.json").read_text())
     assert summary["outcome"] == "completed"
-    assert summary["minutes"] >= 90
     assert [w["setpoint"] for w in summary["windows"]] == [0.8, 0.65, 0.5] * 2
     for window in summary["windows"]:
-        for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
-            assert np.isfinite(window[key])
+        assert all(np.isfinite(window[key]) for key in ("itae", "itae_mean", "settling_min"))
         assert window["steady_abs_error"] < 0.03
         assert window["ise_mean"] == pytest.approx(window["ise"] / 30)
-    assert summary["volume_ml"] == pytest.approx(sum(r["volume_ml"] for r in summary["reactors"].values()))
-
-
-def test_recording_tells_the_whole_run(deployed):
     with open(deployed / "recordings" / "M1.csv", newline="") as f:
         rows = list(csv.DictReader(f))
     minutes = np.array([float(r["time_min"]) for r in rows])
     np.testing.assert_allclose(np.diff(minutes), 1.0)
+    assert summary["minutes"] >= 90
     assert rows[0]["phase"] == "-1"
     assert {r["setpoint"] for r in rows} == {"0.8", "0.65", "0.5"}
     for row in rows:
         assert float(row["volume_ml"]) == pytest.approx(60 * float(row["pump_rate_ml_s"]))
-    summary = json.loads((deployed / "summary.json").read_text())
-    assert sum(float(r["volume_ml"]) for r in rows) == pytest.approx(summary["reactors"]["M1"]["volume_ml"])
-
-
-def test_recording_can_be_calibrated_on(deployed):
-    recording = read_recording(deployed / "recordings" / "M0.csv")
-    assert recording.od.size > 90
-    assert recording.pump_rate.max() <= 0.02
+    given = {name: r["volume_ml"] for name, r in summary["reactors"].items()}
+    assert sum(float(r["volume_ml"]) for r in rows) == pytest.approx(given["M1"])
+    assert summary["volume_ml"] == pytest.approx(sum(given.values()))
+    recording = read_recording(deployed / "recordings" / "M1.csv")  # as a calibration reads it
+    np.testing.assert_allclose(recording.pump_rate, [float(r["pump_rate_ml_s"]) for r in rows])
 
 
 @pytest.mark.slow
@@ -157,20 +146,6 @@ def test_bad_input_ends_in_one_line(word, parts, tmp_path):
     assert all(part in done.stderr for part in parts)
     assert len([line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]) == 1
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("kind", registry.KINDS[registry.DENSITY])
-def test_every_controller_runs_and_is_recorded(kind, tmp_path):
-    config = DeployConfig(scenario=Scenario((0.3,), (3.0,), (37.0,)), controller=registry.config(kind), fsync=False)
-    with closing(Record(tmp_path, config.backend.reactors, config.fsync)) as record:
-        with assemble.opened(assemble.unpack(config, tmp_path), record) as loop:
-            for step in loop.run():
-                record.done(step, loop.state())
-        assert [len(rows) for rows in record.rows] == [4]
-    decisions = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
-    assert len(decisions) == 4
-    if kind == "mpc":
-        assert len(decisions[0]["why"]["planned_rate"]) == registry.config(kind).horizon
 
 
 def test_a_run_says_which_reactor_was_stopped_and_what_each_of_them_was_given(tmp_path, monkeypatch, caplog):
@@ -397,42 +372,6 @@ def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
         again.step()
     assert lab.device.apps["M0"].data["OD"]["ON"] == 1
     assert lab.truth()["od"] == pytest.approx(0.5, abs=0.05)
-
-
-def test_a_lasting_reason_is_told_once(caplog):
-    lab = DriverLab(("M0", "M1"), od=0.55)
-    lab.reactors.begin()
-    loop = handing_over(lab)
-    log_changes = ChangeLog(loop)
-    with caplog.at_level("WARNING"):
-        while lab.clock.now() < 1800.0:
-            log_changes(loop.step())
-    assert loop.reactors.handed_over.all()
-    assert len([r for r in caplog.records if "budget" in r.message]) == 2
-    assert len(caplog.records) <= 4
-
-
-def test_a_resumed_run_goes_on_with_its_own_policy(tmp_path):
-    """Whatever became of the file, or is the latest one, meanwhile."""
-    source, folder = tmp_path / "policy.npz", tmp_path / "run"
-    folder.mkdir()
-    policy.save(source, inverse_policy())
-    config = DeployConfig(policy=str(source))
-
-    def flown(name: str | None = None) -> policy.Policy:
-        backend = ChiBioConfig() if name else config.backend
-        found = assemble.unpack(replace(config, backend=backend, resume=name), folder).policy
-        assert found is not None
-        return found
-
-    first = flown()
-    other = replace(first, biases=(first.biases[0] + 1.0, *first.biases[1:]))
-    policy.save(source, other)
-    np.testing.assert_array_equal(flown(str(folder)).biases[0], first.biases[0])
-    source.unlink()
-    flown(str(folder))
-    policy.save(source, other)
-    np.testing.assert_array_equal(flown().biases[0], other.biases[0])
 
 
 def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp_path, monkeypatch):

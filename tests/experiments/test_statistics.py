@@ -128,18 +128,6 @@ def test_totals_are_sums_over_windows() -> None:
     assert totals([still])[0]["effort_ul_s"] == pytest.approx(20.0 * 2.0 / 50.0)
 
 
-def test_totals_keep_replicates_and_windows_apart() -> None:
-    [found] = totals([trial(error=(0.1, 0.2, 0.6))])
-    assert (found["n"], found["held"]) == (3, 4.0)
-    assert found["effort_ul_s"] == pytest.approx(3.8)
-    assert found["media_ml"] == pytest.approx(100.0)
-    assert found["itae_median"] == pytest.approx(650.0 * 0.2 + 3.0)
-    assert found["itae_mean"] == pytest.approx(650.0 * 0.3 + 3.0)
-    assert found["clean_steady_abs_error"] == pytest.approx(0.29 + 0.5 * 0.3 / 11.0)
-    small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")
-    assert small[2]["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
-
-
 def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     mine, theirs = trial("mpc", (0.1, 0.2, 0.15)), trial("pi", (0.2, 0.3, 0.26))
     strange = replace(theirs, cell=Cell("dqn", "noisy", "steps"))
@@ -158,6 +146,8 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert total_pairs([mine, theirs], "mpc")[1]["verdict"] == "higher"
     same = pairs([replace(theirs, cell=Cell("dqn", "quiet", "steps")), theirs], "pi")
     assert {p["verdict"] for p in same} == {"no difference shown"}
+    small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")
+    assert small[2]["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
     perfect = replace(theirs, od=np.where(theirs.minute < 20.0, 0.5, 0.8) * np.ones((3, 1)))
     assert math.isnan(pairs([mine, perfect], "pi")[3]["percent"])
 
@@ -183,7 +173,8 @@ def test_medians_of_costs_and_of_differences_are_those_of_the_replicates_and_not
     assert (second["ise_median"], second["itae_median"]) == pytest.approx((30.0 * 0.04**2, 450.0 * 0.04))
     [whole] = totals([trial(error=off)])
     each = [20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) + 30.0 * e**2 for e in off]
-    assert whole["ise_median"] == pytest.approx(sorted(each)[3])
+    assert (whole["ise_median"], whole["itae_median"]) == pytest.approx((sorted(each)[3], 650.0 * 0.04 + 3.0))
+    assert (whole["n"], whole["held"]) == (7, 6.0)
     late = pairs([trial("mpc", tuple(0.1 + e for e in off)), trial("pi", (0.1,) * 7)], "pi")[3]
     assert (late["difference"], late["median"]) == pytest.approx((450.0 * sum(off) / 7.0, 450.0 * 0.04))
     assert late["median_ci95"] == pytest.approx([450.0 * 0.01, 450.0 * 0.9])

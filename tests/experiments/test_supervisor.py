@@ -1,7 +1,6 @@
 """The policy that ships under its supervisor: which law acts, what the journal and the console say of it."""
 
 import logging
-import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -274,35 +273,6 @@ def begun(folder: Path) -> tuple[Rehearsal, RelativeController, ChangeLog]:
     law = run.loop.density.law
     assert isinstance(law, RelativeController)
     return run, law, ChangeLog(run.loop)
-
-
-@pytest.mark.slow
-def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journal_every_time(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """M0's estimate is spoilt for five samples; M1's never is."""
-    run, law, log_changes = begun(tmp_path)
-    spoilt = 0
-    with caplog.at_level(logging.INFO):
-        for step in run.run(1860.0):
-            log_changes(step)
-            if step.minute[0] > 20.0 and spoilt < 5:
-                spoilt += int(step.rows[0])
-                law.estimator._noise[0] = 1e9
-                in_doubt(law, 0, 1e3)
-            elif spoilt == 5:
-                law.estimator._noise[0] = 1.0
-                spoilt += 1
-    run.close()
-    said = [r.getMessage() for r in caplog.records if "policy acts" in r.getMessage() or "law acts" in r.getMessage()]
-    rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
-    acted = [r["row"]["time_min"] for r in rows if r["reactor"] == "M0" and r["why"]["supervised"] == 1.0]
-    after = [r["row"]["time_min"] for r in rows if r["reactor"] == "M0" and r["row"]["time_min"] > acted[-1]]
-    assert [re.findall(r"M\d|law acts|policy acts|minute \d+", line) for line in said] == [
-        ["M0", "law acts", f"minute {acted[0]:.0f}"], ["M0", "policy acts", f"minute {after[0]:.0f}"],
-    ]  # fmt: skip
-    assert 4 <= len(acted) <= 6
-    assert not any(r["why"]["supervised"] for r in rows if r["reactor"] == "M1")
 
 
 def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(

@@ -89,13 +89,6 @@ def test_jobs_without_a_result_are_named(trained: Path) -> None:
     assert f"python -m experiments.train -m resume={trained}" in text
 
 
-def test_curves_are_those_of_every_seed_of_every_job(trained: Path) -> None:
-    jobs = [sweep_results.Result(trained / str(k), {}, "finished") for k in range(2)]
-    steps, values = sweep_results.curve(jobs, "eval/regret_pct")
-    np.testing.assert_array_equal(steps, [100, 200])
-    np.testing.assert_array_equal(values, [[1, 2, 3, 10], [0.5, 1, 1.5, 5]])
-
-
 def test_a_seed_that_two_jobs_trained_has_a_curve_of_each(tmp_path: Path) -> None:
     for k, regret in enumerate((4.0, 9.0)):
         (tmp_path / str(k)).mkdir()

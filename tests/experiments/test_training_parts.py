@@ -173,6 +173,8 @@ def test_a_run_that_may_end_early_is_the_same_run_up_to_the_step_at_which_its_sl
     assert summaries[0]["ended"] == early.ended != whole.ended == "agent.total_steps"
     assert early.ended.startswith("every kept policy is within 1 % regret")
     assert summaries[0] == summaries[1]
+    again.best.merit[0] = 2.1
+    assert again.ended == "agent.total_steps"
 
 
 def aiming(gain: float) -> torch.Tensor:

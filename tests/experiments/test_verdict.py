@@ -76,6 +76,10 @@ def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
         "interlock spoke in 3 samples",
     ]
     assert said.remark == "Good: 2 of 2 windows ended within 5 % of their setpoint."
+    largest = [WINDOW, {"setpoint": 0.8, "steady_abs_error": 0.03}, {"setpoint": 0.6, "steady_abs_error": 0.01}]
+    said = verdict(DEPLOYED | {"windows": largest}, LOOP)  # 0.03 OD is 6 % of 0.5 and less than 4 % of 0.8
+    assert said.items[0] == "largest error at rest 0.03 OD, the mean over the last 10 min of a window"
+    assert said.remark == "Good: 3 of 3 windows ended within 5 % of their setpoint."
     away = {**WINDOW, "steady_abs_error": 0.026}  # 5 % of 0.5 is 0.025
     missing = {**WINDOW, "steady_abs_error": None}
     for windows, held in (([WINDOW, away], "1 of 2"), ([WINDOW, missing], "1 of 2")):
@@ -132,16 +136,6 @@ def test_the_page_begins_with_it_and_names_units_and_no_place_of_this_machine(tm
     assert "http://192.168.7.2:5000/x" in text
     for words in ("<th>volume, mL</th>", "<th>setpoint, OD</th>", "<th>steady_abs_error, OD</th>"):
         assert words in text
-
-
-def test_each_window_is_judged_by_its_own_setpoint_and_the_largest_error_is_named() -> None:
-    """0.03 OD is 6 % of 0.5 and less than 4 % of 0.8; medium and interlock are those of all reactors."""
-    windows = [WINDOW, {"setpoint": 0.8, "steady_abs_error": 0.03}, {"setpoint": 0.6, "steady_abs_error": 0.01}]
-    said = verdict(DEPLOYED | {"windows": windows}, LOOP)
-    assert said.items[0] == "largest error at rest 0.03 OD, the mean over the last 10 min of a window"
-    assert said.remark == "Good: 3 of 3 windows ended within 5 % of their setpoint."
-    windows[1] = {"setpoint": 0.5, "steady_abs_error": 0.03}
-    assert verdict(DEPLOYED | {"windows": windows}, LOOP).remark.startswith("Not good: 2 of 3 windows")
 
 
 def test_a_calibration_says_what_it_used_and_what_speaks_against_it() -> None:
