@@ -56,16 +56,6 @@ def _train(trainer: Trainer) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("changes", [{}, {"action_gap": 0.5, "huber": 0.5}], ids=["plain", "all"])
-def test_solves_the_identity_problem(changes: dict[str, Any]) -> None:
-    """Every one of 4 agents picks the paying action for every symbol, and Q is 1 / (1 - gamma) there."""
-    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "epsilon_end": 0.3, **changes})
-    trainer = _train(_trainer(config, range(4)))
-    q = trainer.agent.online(torch.eye(3).expand(4, 3, 3))
-    assert torch.equal(q.argmax(-1), torch.arange(3).expand(4, 3))
-    torch.testing.assert_close(q.amax(-1), torch.full((4, 3), 2.0), rtol=0.1, atol=0.1)
-
-
 def test_one_update_agrees_with_torch() -> None:
     """Minibatch, target, squared error and Adam's step, recomputed with autograd from the same draws."""
     config = DQNConfig(**{**SMALL.__dict__, "learn_start": 40, "total_steps": 41, "gamma": 0.9})

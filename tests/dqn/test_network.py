@@ -50,17 +50,6 @@ def test_forward_and_backward_agree_with_autograd(decay: float | None) -> None:
             torch.testing.assert_close(bias[i, 0].double(), linear.bias.grad, rtol=1e-4, atol=1e-5)
 
 
-def test_agents_do_not_see_one_another() -> None:
-    flat = _flat()
-    network = QNetwork(flat, SIZES)
-    observation = torch.ones(AGENTS, BATCH, SIZES[0])
-    before = network(observation).clone()
-    flat[1] += 1.0
-    after = network(observation)
-    assert torch.equal(before[[0, 2]], after[[0, 2]])
-    assert not torch.equal(before[1], after[1])
-
-
 def test_maps_of_inputs_and_outputs_stay_with_other_weights_and_are_reported_as_copies() -> None:
     matrix, offset = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.tensor([0.0, -1.2, 0.25])
     sizes, basis, observation = (3, 4, 2), action_basis(2, 1.0), torch.rand(AGENTS, BATCH, 2)

@@ -59,17 +59,6 @@ def test_several_minibatches_at_once_are_the_same_rows() -> None:
         assert torch.equal(several, torch.stack(each, dim=1))
 
 
-def test_uniform_frequencies() -> None:
-    """Every row is drawn equally often: chi-square over 10 rows, 20 000 draws."""
-    rng = np.random.default_rng(2)
-    replay = Replay(1, 10, OBSERVATIONS, CPU)
-    for k in range(10):
-        replay.add(**{**_step(rng, 1), "r_t": np.array([float(k)])})
-    rows = replay.sample(rng.random((1, 20_000))).r_t.long()
-    count = torch.bincount(rows[0], minlength=10).numpy()
-    assert ((count - 2000.0) ** 2 / 2000.0).sum() < 27.9  # 99.9 % quantile with 9 degrees of freedom
-
-
 def test_a_minibatch_is_a_copy_with_its_types_also_of_the_last_row() -> None:
     replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
     for _ in range(7):

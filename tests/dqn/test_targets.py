@@ -31,21 +31,6 @@ def _exact() -> torch.Tensor:
     return torch.tensor([[GAMMA * v0, v0], [v1, GAMMA * v0]])
 
 
-def test_one_target_by_hand() -> None:
-    q_t = torch.tensor([[[1.0, 5.0], [4.0, 3.0], [4.0, 3.0]]])
-    reward, continues = torch.tensor([[1.0, 2.0, 2.0]]), torch.tensor([[1.0, 1.0, 0.0]])
-    # 1 + 0.9 * 5, 2 + 0.9 * 4, and 2 alone where the episode terminated
-    torch.testing.assert_close(q_target(reward, continues, GAMMA, q_t), torch.tensor([[5.5, 5.6, 2.0]]))
-
-
-def test_q_iteration_reaches_the_exact_values() -> None:
-    _, _, reward, after = _all_transitions()
-    q = torch.zeros(2, 2)
-    for _ in range(200):
-        q = q_target(reward, torch.ones(1, 4), GAMMA, q[after]).view(2, 2)
-    torch.testing.assert_close(q, _exact(), rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize("alpha", [0.5, 0.9])
 def test_advantage_learning_widens_gaps_and_keeps_values(alpha: float) -> None:
     """Its fixed point: the same V, the same greedy actions, gaps 1 / (1 - alpha) times as wide."""
@@ -57,11 +42,6 @@ def test_advantage_learning_widens_gaps_and_keeps_values(alpha: float) -> None:
     exact = _exact()
     value = exact.amax(1, keepdim=True)
     torch.testing.assert_close(q, value - (value - exact) / (1.0 - alpha), rtol=1e-4, atol=1e-4)
-
-
-def test_no_advantage_no_change() -> None:
-    state, action, reward, _ = _all_transitions()
-    assert torch.equal(advantage_target(reward, 0.0, _exact()[state], action), reward)
 
 
 @pytest.mark.parametrize("huber", [0.0, 0.3])

@@ -482,14 +482,6 @@ def test_a_policy_that_is_none_or_says_no_model_ends_in_one_line(tmp_path: Path)
         command.body(CertifyConfig(policy=str(tmp_path)), tmp_path)
 
 
-def test_another_model_is_one_override_away() -> None:
-    assert command.main.config([]).env is None
-    assert command.main.config(["env=sim"]).env == EnvConfig()
-    given = command.main.config(["env.mu=0.02", "limits.entry=1.2"])
-    assert given.env == EnvConfig(mu=0.02)
-    assert given.limits.entry == 1.2
-
-
 def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> None:
     """ln(1 + 0.005/0.1) / 0.06 = 0.813; at OD 1 it is 0.083, below the constant bound."""
     bounds = EstimateBounds(0.06, 0.1, 0.005, 0.05, 0.0, (0.05, 0.97), (0.2, 1.0))

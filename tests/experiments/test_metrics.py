@@ -6,16 +6,6 @@ import pytest
 from experiments.loop.metrics import mean_errors, window_metrics
 
 
-def test_decaying_error_has_ise_one_half_and_itae_one():
-    """int exp(-2t) dt = 1/2 and int t exp(-t) dt = 1 over [0, inf)."""
-    t = np.linspace(0.0, 40.0, 40_001)[None]
-    m = window_metrics(t, 0.5 + np.exp(-t), 0.5, 0.0, 40.0)
-    assert m.ise[0] == pytest.approx(0.5, abs=1e-6)
-    assert m.itae[0] == pytest.approx(1.0, abs=1e-6)
-    assert m.ise_mean[0] == pytest.approx(0.5 / 40.0, abs=1e-7)
-    assert m.itae_mean[0] == pytest.approx(1.0 / 40.0, abs=1e-7)
-
-
 def test_constant_error_from_the_windows_start():
     """e = 0.1 for 30 min, one sample a minute: ISE 0.3, ITAE 45; time counts from the window, not from the run."""
     t = np.arange(0.0, 91.0)[None]
@@ -52,20 +42,6 @@ def test_missing_samples_are_bridged():
     holes = window_metrics(holes_t[None], holes_od[None], 0.5, 0.0, 30.0)
     assert full.ise[0] == pytest.approx(1e-4 * 30**3 / 3, rel=2e-3)
     assert holes.ise[0] == pytest.approx(full.ise[0], rel=5e-3)
-
-
-def test_a_batch_is_its_single_rows_and_empty_rows_are_nan():
-    rng = np.random.default_rng(0)
-    t = np.tile(np.arange(0.0, 91.0), (8, 1))
-    od = rng.uniform(0.3, 0.9, t.shape)
-    od[5] = np.nan
-    batch = window_metrics(t, od, 0.65, 30.0, 60.0)
-    for i in range(8):
-        one = window_metrics(t[i : i + 1], od[i : i + 1], 0.65, 30.0, 60.0)
-        for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
-            np.testing.assert_array_equal(getattr(one, key)[0], getattr(batch, key)[i])
-    assert np.isnan(batch.ise[5])
-    assert np.isnan(batch.steady_abs_error[5])
 
 
 def test_a_run_without_a_sample_has_no_metrics():

@@ -12,13 +12,9 @@ import pytest
 
 from dqn import policy as policies
 from dqn.policy import RELATIVE, Policy
-from envs.bench import Bench
 from envs.relative import nearest_level
-from envs.task import EnvConfig
-from experiments.certification import certificate
 from experiments.control.policies import SHIPPED, find_policy
 from experiments.laws.density.estimator import EstimatorConfig
-from experiments.laws.density.learned import settings
 from experiments.train import main
 from experiments.training.run import fingerprint
 
@@ -80,12 +76,3 @@ def test_it_is_what_its_command_trains() -> None:
     assert shipped.metadata["seed"] in range(config.seed, config.seed + config.n_agents)
     assert shipped.metadata["estimator"] == asdict(EstimatorConfig())
     assert find_policy("shipped") == SHIPPED
-
-
-def test_it_has_the_certificate_that_a_device_asks_for() -> None:
-    shipped = policies.load(SHIPPED)
-    run = [0.2, 0.5, 1.0], Bench(), EnvConfig(), "shipped"
-    assert certificate.judged(shipped, settings(shipped), SHIPPED, *run) == certificate.Opinion([], [])
-    bounds = certificate.bounds(shipped, settings(shipped), SHIPPED, EnvConfig())
-    assert bounds is not None
-    assert bounds.full_pump == pytest.approx(0.02 * 1.0 / (1 / 3))

@@ -331,20 +331,6 @@ def test_the_last_line_is_about_the_worst_of_all_seeds(regret: list[float], stea
     assert announcements._verdict(score, Density(EnvConfig())) == said
 
 
-def test_a_resumed_training_goes_on_with_the_model_that_it_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The calibration's folder may be gone, or hold another model, by then."""
-    monkeypatch.setattr(train_run, "Session", Mock(side_effect=CheckpointError("far enough")))
-    file = tmp_path / "calibrated.yaml"
-    file.write_text("mu: 0.02\ntau: 0.4\n")
-    with pytest.raises(UserError, match="far enough"):
-        train_run.train(TrainConfig(env_file=str(file), agent=SMALL), tmp_path)
-    kept: Any = OmegaConf.load(tmp_path / "config.yaml")
-    assert (kept.env_file, kept.env.mu, kept.env.tau) == (None, 0.02, 0.4)
-    assert train_run.Session.call_args.args[0].env == EnvConfig(mu=0.02, tau=0.4)  # type: ignore[attr-defined]
-
-
 def test_episodes_with_a_change_are_grouped_by_the_share_at_which_they_rest() -> None:
     """Each reported pair of setpoints once; the second of the two is asked for at the end."""
     task = Coculture(CocultureConfig(preview_min=360.0))
@@ -802,6 +788,10 @@ def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_re
     assert config.env == replace(env, scale_e=1.2, pair=pair)
     kept: Any = OmegaConf.load(tmp_path / "config.yaml")
     assert (kept.env_file, kept.env.scale_e, kept.env.pair.second.name) == (None, 1.2, "B. subtilis")
+    with pytest.raises(UserError, match="far enough"):
+        train_run.train(TrainConfig(env=env, env_file="run", agent=SMALL), tmp_path)
+    kept = OmegaConf.load(tmp_path / "config.yaml")
+    assert (kept.env_file, kept.env.scale_e, kept.env.pair.second.name) == (None, 1.2, "P. putida")
     monkeypatch.setattr(train_run, "read_pair", Mock(side_effect=UserError("gone, or of another pair by now")))
     with pytest.raises(UserError, match="far enough"):
         train_run.train(replace(config, resume="latest"), tmp_path)
