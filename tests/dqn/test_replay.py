@@ -49,16 +49,6 @@ def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -
                 np.testing.assert_array_equal(drawn[i, j].numpy(), expected[name][i])
 
 
-def test_several_minibatches_at_once_are_the_same_rows() -> None:
-    rng = np.random.default_rng(5)
-    replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
-    for _ in range(5):
-        replay.add(**_step(rng))
-    uniform = rng.random((AGENTS, 4, 6))
-    for several, *each in zip(replay.sample(uniform), *(replay.sample(uniform[:, k]) for k in range(4)), strict=True):
-        assert torch.equal(several, torch.stack(each, dim=1))
-
-
 def test_a_minibatch_is_a_copy_with_its_types_also_of_the_last_row() -> None:
     replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
     for _ in range(7):

@@ -11,16 +11,6 @@ def _seeds(numbers: range) -> list[np.random.SeedSequence]:
     return [np.random.SeedSequence(n) for n in numbers]
 
 
-def test_agent_of_a_population_equals_the_agent_alone() -> None:
-    many = UniformStream(_seeds(range(8)), 3)
-    alone = [UniformStream(_seeds(range(i, i + 1)), 3) for i in range(8)]
-    for _ in range(2 * CALLS_PER_BLOCK + 5):
-        together = many.take(1)
-        assert together.shape == (8, 1, 3)
-        for i in range(8):
-            np.testing.assert_array_equal(together[i], alone[i].take(1)[0])
-
-
 def test_numbers_are_those_of_the_generator() -> None:
     stream = UniformStream(_seeds(range(1)), 2)
     rng = np.random.default_rng(np.random.SeedSequence(0))

@@ -1,4 +1,4 @@
-"""The loop of agent and environment, on a chain whose values are known by hand."""
+"""The loop of agent and environment, whose copies end at other steps and in other ways."""
 
 from typing import Any
 
@@ -15,73 +15,6 @@ from tests.dqn.problems import streams
 pytestmark = pytest.mark.numeric
 
 Array = NDArray[Any]
-
-
-class Chain:
-    """Two states, shown one-hot: 0 leads to 1 and pays 0, 1 leads to itself and pays 1, whatever the action.
-
-    Each episode is cut off after one step; they start in 0, 0, 1, 0, 0, 1 ..., all copies in the same state. With
-    discount g, V(1) = 1 / (1 - g) and V(0) = g V(1).
-    """
-
-    def __init__(self, copies: int) -> None:
-        self.copies, self._starts = copies, 0
-        self._state = 0
-
-    def _show(self, state: int) -> Array:
-        return np.tile(np.eye(2, dtype=np.float32)[state], (self.copies, 1))
-
-    def _begin(self) -> Array:
-        self._state = 1 if self._starts % 3 == 2 else 0
-        self._starts += 1
-        return self._show(self._state)
-
-    def reset(self) -> tuple[Array, dict[str, Any]]:
-        return self._begin(), {}
-
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        paid, cut = np.full(self.copies, float(self._state)), np.ones(self.copies, dtype=np.bool_)
-        infos = {"final_obs": self._show(1), "_final_obs": cut}
-        return self._begin(), paid, np.zeros(self.copies, dtype=np.bool_), cut, infos
-
-    def state_dict(self) -> dict[str, Any]:
-        raise NotImplementedError
-
-    def load_state_dict(self, state: dict[str, Any]) -> Array:
-        raise NotImplementedError
-
-
-def test_what_follows_a_cut_episode_is_what_it_reached_and_not_where_the_next_one_starts() -> None:
-    """V(1) = 1 / (1 - 0.8) = 5 and V(0) = 0.8 * 5 = 4; from the starts of the next episodes it were 2.4 and 1.8."""
-    config = DQNConfig(
-        hidden=(16,), gamma=0.8, learning_rate=3e-3, total_steps=900, epsilon_end=1.0, learn_start=32, batch_size=32,
-        target_period=20, replay_size=900,
-    )  # fmt: skip
-    trainer = Trainer(Chain(4), DQNAgent(config, 2, 2, streams(range(4))), interval=100)
-    returns = np.array([record.episode_return for record in trainer.run()])
-    q = trainer.agent.online(torch.eye(2).expand(4, 2, 2))
-    torch.testing.assert_close(q[:, 1], torch.full((4, 2), 5.0), rtol=0.05, atol=0.0)
-    torch.testing.assert_close(q[:, 0], torch.full((4, 2), 4.0), rtol=0.05, atol=0.0)
-    assert set(returns.ravel().tolist()) <= {0.0, 1.0}
-
-
-def test_torch_keeps_no_graph_while_it_trains_and_goes_on_when_it_is_used_afterwards() -> None:
-    class Asked(Chain):
-        kept: bool = False
-
-        def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-            self.kept |= not torch.is_inference_mode_enabled()
-            return super().step(actions)
-
-    config = DQNConfig(hidden=(8,), total_steps=40, learn_start=10, batch_size=4, target_period=7, replay_size=50)
-    env = Asked(2)
-    trainer = Trainer(env, DQNAgent(config, 2, 2, streams(range(2))), interval=15)
-    assert [record.step for record in trainer.run()] == [15, 30, 40]
-    assert not env.kept
-    before = trainer.agent.online.flat.clone()
-    trainer.agent.learn()
-    assert not torch.equal(before, trainer.agent.online.flat)
-    trainer.agent.load_state_dict(trainer.agent.state_dict())
 
 
 class Uneven:
@@ -118,6 +51,25 @@ class Uneven:
     def load_state_dict(self, state: dict[str, Any]) -> Array:
         self._step = np.array(state["step"])
         return self._show()
+
+
+def test_torch_keeps_no_graph_while_it_trains_and_goes_on_when_it_is_used_afterwards() -> None:
+    class Asked(Uneven):
+        kept: bool = False
+
+        def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+            self.kept |= not torch.is_inference_mode_enabled()
+            return super().step(actions)
+
+    config = DQNConfig(hidden=(8,), total_steps=40, learn_start=10, batch_size=4, target_period=7, replay_size=50)
+    env = Asked()
+    trainer = Trainer(env, DQNAgent(config, 1, 2, streams(range(2))), interval=15)
+    assert [record.step for record in trainer.run()] == [15, 30, 40]
+    assert not env.kept
+    before = trainer.agent.online.flat.clone()
+    trainer.agent.learn()
+    assert not torch.equal(before, trainer.agent.online.flat)
+    trainer.agent.load_state_dict(trainer.agent.state_dict())
 
 
 def uneven(total_steps: int = 8) -> Trainer:

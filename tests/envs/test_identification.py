@@ -142,24 +142,6 @@ def test_intervals_allow_for_correlated_noise() -> None:
         assert 0.87 <= share <= 0.99
 
 
-def test_intervals_are_as_wide_as_the_estimates_scatter() -> None:
-    """Half width over the Monte Carlo sd of one experiment: 1.96 for a known variance, more for an estimated one."""
-    config = OpenLoop(noise_correlation=0.3)
-    time, od, pump_rate = open_loop(config, np.random.default_rng(30))
-    truth = trajectory(time, pump_rate[0], config.mu, config.tau, config.start_od)
-    np.testing.assert_allclose(od[0], truth, rtol=0.05)
-    rng, found = np.random.default_rng(31), []
-    for _ in range(200):
-        error = rng.standard_normal(len(time))
-        for i in range(1, len(time)):
-            error[i] = 0.3 * error[i - 1] + np.sqrt(1 - 0.3**2) * error[i]
-        found.append(fit(series(time, truth * (1 + 0.01 * error), pump_rate[0])))
-    for values in ([f.mu for f in found], [f.tau for f in found]):
-        known = [v for v in values if v is not None]
-        ratio = np.mean([v.half_width for v in known]) / np.std([v.value for v in known])
-        assert 1.8 < ratio < 2.7
-
-
 # ---------------------------------------------------------------- identifiability
 
 

@@ -330,29 +330,6 @@ def test_growth_alone_waits_until_the_last_dose_is_seen() -> None:
 # ---------------------------------------------------------------- fine rows
 
 
-def test_rows_of_a_second_are_merged_to_minutes_that_keep_the_volume() -> None:
-    rng = np.random.default_rng(2)
-    n = 4 * 3600
-    time = np.arange(n) / 60.0
-    rate = np.where(rng.random(n // 30).repeat(30) < 0.4, 0.02, 0.0)
-    volume = np.concatenate([[0.0], np.cumsum(rate[:-1] / 60.0)])
-    od = 0.4 * np.exp(0.02 * time - volume / 0.4) * (1.0 + 0.02 * rng.standard_normal(n))
-    od[::97] = np.nan
-    fine = Series(time, od, rate, np.arange(n))
-    coarse = merged(fine)
-    assert len(coarse.time) == 240
-    assert np.diff(coarse.time) == pytest.approx(1.0, abs=0.02)  # the last second has a reading or not
-    assert coarse.row[:3].tolist() == [0, 60, 120]
-    moved = np.sum(coarse.pump_rate[:-1] * np.diff(coarse.time))
-    first, last = (round(60.0 * float(t)) for t in coarse.time[[0, -1]])
-    assert moved == pytest.approx(volume[last] - volume[first], rel=1e-9)
-    truth = 0.4 * np.exp(0.02 * coarse.time - np.interp(coarse.time, time, volume) / 0.4)
-    assert np.median(np.abs(coarse.od / truth - 1.0)) < 0.006
-    found = calibrate(coarse)
-    assert found.mu.low <= 0.02 <= found.mu.high
-    assert found.tau.low <= 0.4 <= found.tau.high
-
-
 def test_rows_that_are_few_or_slow_stay_as_they_are() -> None:
     few = recorded("random")
     assert merged(few) is few
