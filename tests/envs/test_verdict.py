@@ -69,6 +69,13 @@ def test_a_window_ends_where_growth_steps() -> None:
     assert result.verdict.word == "use with care"
 
 
+@pytest.mark.slow
+def test_growth_that_wanders_is_no_step() -> None:
+    for seed in range(4):
+        result = calibrate(recorded("threshold", seed, hours=14.0, wander=0.1))
+        assert result.window == (0, 841)
+
+
 def test_doses_that_spread_and_a_vial_that_mixes_slowly_are_told() -> None:
     uneven = calibrate(recorded("random", dose_spread=0.45, hours=9.0))
     assert any("doses spread by" in w and "calibrate_pump" in w for w in uneven.warnings)

@@ -242,8 +242,11 @@ def test_what_was_counted_stands_before_the_note_which_is_cut_to_a_line(tmp_path
     assert (second.text, second.level_ml, third.text, third.level_ml) == ("level 0 mL", 0.0, "level 40 mL, foam", 40.0)
     with pytest.raises(ValueError, match=r"share = 0\.4: allowed null beside level_ml: mark them one after the other"):
         MarkConfig(str(folder), "M0", share=0.4, level_ml=20.0)
-    with pytest.raises(ValueError, match=r"reactor = '': allowed the one in which level_ml or share was measured"):
-        MarkConfig(str(folder), share=0.4)
+    for measured in ({"share": 0.4}, {"level_ml": 18.5}):
+        with pytest.raises(ValueError, match=r"reactor = '': allowed the one in which level_ml or share was measured"):
+            MarkConfig(str(folder), **measured)
+    with pytest.raises(ValueError, match="minute = 3.0"):  # a level is of now
+        MarkConfig(str(folder), "M0", level_ml=18.5, minute=3.0)
     (folder / "journal.jsonl").write_text("")
     with pytest.raises(frame.UserError, match=r"run=.*run: has not begun; wait for its first sample"):
         mark(MarkConfig(str(folder), "M0"))
@@ -264,17 +267,6 @@ def test_a_sample_may_be_of_any_minute_up_to_the_newest_row_of_any_reactor(tmp_p
         mark(MarkConfig(str(over), "M3", minute=1.0))
     with pytest.raises(frame.UserError, match=r"minute=93\.6: allowed up to 94"):
         mark(MarkConfig(str(over), "M0", share=0.4, minute=93.6))
-
-
-def test_a_level_is_of_one_reactor_and_of_now(tmp_path: Path) -> None:
-    folder = _under_way(tmp_path / "run")
-    said = mark(MarkConfig(str(folder), "M0", level_ml=18.5))
-    assert said.startswith("M0: level 18.5 mL at minute ")
-    (found,) = read_marks(folder)
-    assert (found.reactor, found.level_ml) == ("M0", 18.5)
-    for wrong, message in (({}, "reactor = ''"), ({"reactor": "M0", "minute": 3.0}, "minute = 3.0")):
-        with pytest.raises(ValueError, match=message):
-            MarkConfig(str(folder), level_ml=18.5, **wrong)
 
 
 def _under_way(folder: Path, kind: str = "emulator") -> Path:
