@@ -153,16 +153,12 @@ def test_the_preset_names_the_kind_and_leaves_the_rest_to_the_defaults(kind: str
     assert presets.load(f"controller/{kind}") == {"kind": kind}
 
 
-def test_threshold_and_hold_by_hand() -> None:
+def test_threshold_by_hand() -> None:
     threshold = Threshold(ThresholdConfig(rate=0.015, hysteresis=0.02))
     threshold.reset(1)
     path = [0.49, 0.51, 0.49, 0.481, 0.48, 0.49, 0.501]
     rates = [threshold.act(np.array([x]), np.array([0.5]), np.zeros(1), np.ones(1, dtype=bool))[0] for x in path]
     np.testing.assert_allclose(rates, [0.0, 0.015, 0.015, 0.015, 0.0, 0.0, 0.015])
-    hold = Hold(HoldConfig(), MODEL)
-    hold.reset(2)
-    u = hold.act(np.array([0.1, 2.0]), np.full(2, 0.5), np.zeros(2), np.ones(2, dtype=bool))
-    np.testing.assert_allclose(u, 0.01)  # mu tau
 
 
 @pytest.mark.parametrize(
