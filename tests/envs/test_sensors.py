@@ -88,17 +88,6 @@ def test_a_reading_that_freezes_is_repeated_5_to_30_times_each_number_as_likely(
     assert starts == pytest.approx(0.02, rel=0.1)
 
 
-def test_a_chance_freeze_repeats_for_any_of_5_to_30_readings_and_for_no_other_number() -> None:
-    r = readings(SensorConfig(noise_floor=0.003, freeze_rate=0.02), 0.5, m=1000)
-    equal = np.pad(np.diff(r, axis=0) == 0.0, ((1, 1), (0, 0)))  # frozen where it is the reading before
-    starts, ends = (np.flatnonzero(np.diff(equal.T.astype(int)) == step) for step in (1, -1))
-    row = equal.shape[0] - 1
-    lengths = (ends - starts)[ends % row < row - 1]  # without those that the last reading cut off
-    counts = np.bincount(lengths)
-    assert np.flatnonzero(counts).tolist() == list(range(5, 31))
-    assert counts[5:] == pytest.approx(counts.sum() / 26.0, rel=0.4)
-
-
 def test_frozen_switch_repeats_exactly_and_thaws() -> None:
     s = sensor(SensorConfig(noise_floor=0.01), 2)
     od = np.full(2, 0.5)

@@ -474,16 +474,6 @@ def test_a_low_culture_grows_only_if_it_does_at_its_slowest(action: int, exact: 
         assert proof.grows.tolist() == [grows]
 
 
-def test_a_million_samples_do_not_see_the_spike() -> None:
-    points = np.random.default_rng(4).uniform([0.05, 0.4], [1.5, 0.8], (1_000_000, 2))
-    near = points[np.abs(points[:, 1] - laws.SPIKE) < 1e-5]  # all others are alike by construction
-    np.testing.assert_array_equal(laws.spike().act(near), laws.law().act(near))
-    where = np.array([[0.45, laws.SPIKE]])
-    assert laws.spike().act(where)[0] == 16
-    assert laws.law().act(where)[0] == 0
-    assert recheck(laws.spike(), FAST, [0.4, 0.5, 0.6, 0.7, 0.8]) == []
-
-
 def test_a_swap_of_one_level_is_listed_and_does_no_harm() -> None:
     certificate = proven(laws.swapped_level())
     assert certificate.passed

@@ -97,12 +97,6 @@ def test_reactors_are_judged_by_their_own_band_minutes_and_number_of_steps() -> 
     assert (phase.tolist(), setpoint.tolist(), temperature.tolist()) == ([2, 1], [0.3, 0.6], [30.0, 31.0])
 
 
-@pytest.mark.parametrize("text", ["od => 0.8", "od >= high", "OD >= 0.8", "setled", "od >= 0", "od <= 7", "time"])
-def test_a_misspelt_condition_is_named(text: str) -> None:
-    with pytest.raises(ValueError, match=rf"scenario\.until: '{text}': allowed "):
-        Scenario(until=(text,))
-
-
 def test_conditions_do_not_go_with_shares_and_need_one_for_each_step() -> None:
     with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed \[\] where a share is asked for"):
         Scenario(until=("settled",), ratios=(0.3,))
