@@ -13,8 +13,8 @@ __all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "Rig
 PASSWORD = "PIOREACTOR_MQTT_PASSWORD"
 """Variable of the environment that holds the broker's password; without it and without a file the vendor's own."""
 SHIPPED = "raspberry"  # what the vendor's installation sets, public
-PUBLISHED = "25.11.19"
-"""Version of the vendor's software, the newest of the package index."""
+PUBLISHED = "26.11.1"
+"""Version of the vendor's software that the rig runs, the newest that was tried."""
 FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's most in each vial
 
 JOB_WAIT_S = 12.0  # real seconds in which an accepted job must have shown itself

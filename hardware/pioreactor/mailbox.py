@@ -15,7 +15,7 @@ from hardware.clock import Clock
 from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
 
-__all__ = ["DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
+__all__ = ["CHANNELS", "DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
 
 KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
 MOST_ML = 10.0  # an event tells half a second of a pump
@@ -24,6 +24,7 @@ PUMPS = ("add_media", "add_alt_media", "remove_waste")  # jobs, in the order of 
 DOSING_JOBS = (*PUMPS, "circulate_media", "circulate_alt_media", "pumps", "dosing_automation")
 LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
 ECHOES = ("stirring", "temperature_automation")  # jobs that say all pins of the unit now and then
+CHANNELS = {"1": 17, "2": 13, "3": 16, "4": 12, "5": 18}  # GPIO pin of each PWM channel of the vendor's board
 TWICE_S = 0.2  # two messages that are not of the same instant
 
 
@@ -143,8 +144,10 @@ class Mailbox:
         at = -math.inf if retained else now
         if rest.endswith("/$state") and payload:
             self._state(experiment, rest.removesuffix("/$state"), payload.decode(), at)
-        elif rest == "pwms/dc" and (mine or not retained):
-            duty = {int(pin): _number(dc) for pin, dc in json.loads(payload or b"{}").items()}
+        elif rest in ("pwms/dc", "pwms/channel_dc") and (mine or not retained):
+            said = json.loads(payload or b"{}")
+            said = {CHANNELS.get(k, 0): dc for k, dc in said["channels"].items()} if "channels" in said else said
+            duty = {int(pin): _number(dc) for pin, dc in said.items()}
             echoes = not mine or any(map(self.live, ECHOES))
             for job, number in self.jobs.items():
                 word = next((w for w in LIVE if self.live(job)), self.state(job).word)

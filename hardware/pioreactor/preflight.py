@@ -1,4 +1,4 @@
-"""Before a run: one line per check, passed or with the remedy. Changes nothing on a unit."""
+"""Before a run: one line per check, passed or with the remedy. Of a unit it switches stirring, and nothing else."""
 
 import time
 from collections.abc import Iterator
@@ -9,10 +9,10 @@ from hardware.check import Check
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
 from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import DOSING_JOBS
-from hardware.pioreactor.pumps import Barrier
+from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS
+from hardware.pioreactor.pumps import STEP_S, Barrier
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.station import Station
+from hardware.pioreactor.station import UNHEARD, Station
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.pioreactor.web import NotHeard, Web
 
@@ -64,6 +64,11 @@ def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterat
     sees = ", ".join(f"{k} at {v} degrees" for k, v in eyes.items()) or "none"
     remedy = f"allowed backend.channel or backend.units.{name}.channel one of these, or set it in the vendor's page"
     yield Check(f"{name} photodiode", config.channel in eyes, f"{config.channel} of {sees}", remedy)
+    wired = {pump: CHANNELS.get(channel) for channel, pump in settings.get("PWM", {}).items()}
+    media, _, waste = config.pump_pins
+    seen = f"media and waste at {wired.get('media')} and {wired.get('waste')}, backend.pump_pins = {media} and {waste}"
+    same = (wired.get("media"), wired.get("waste")) == (media, waste)
+    yield Check(f"{name} wiring", same, seen, "give backend.pump_pins, or correct the section PWM in the vendor's page")
     tube = str(settings.get("bioreactor", {}).get(facts(version).tube, "not set"))
     remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"
     same = tube == "not set" or abs(float(tube) - unit.volume_ml) <= 0.5
@@ -76,6 +81,7 @@ def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterat
     remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
     yield _queue(name, web)
+    yield _pins(station)
     largest = f"the vendor has no limit of one dose; ours is {config.max_dose_ml:g} mL"
     yield Check(f"{name} dead man", True, f"{largest}, and every pump job times itself")
 
@@ -110,3 +116,12 @@ def _queue(name: str, web: Web) -> Check:
         clock.sleep(0.1)
     detail = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
     return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")
+
+
+def _pins(station: Station) -> Check:
+    """Whether the unit tells what its pins do."""
+    for _ in station.hear_pins():
+        station.unit.real.sleep(STEP_S)
+    heard = station.doses.pumps.heard
+    told = "told when one is switched" if heard else UNHEARD
+    return Check(f"{station.name} pins", heard, told, f"tried with {', '.join(TESTED)}; look whether stirring runs")

@@ -33,6 +33,7 @@ PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second re
 QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
 LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
+NUDGE = 0.01  # of a duty, %: nobody sees it
 SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
 AGAIN_S = 15.0  # between two of them
 DRAIN_ML = 4.0  # at a time, while a media pump cannot be stopped
@@ -183,9 +184,14 @@ class Pumps:
         )
 
     def ask_pins(self) -> None:
-        """Have stirring say all pins again."""
-        if not math.isnan(self.box.stir_duty):
-            self.unit.say("stirring/duty_cycle/set", f"{self.box.stir_duty:g}")
+        """Have stirring say all pins again: by a duty that differs a little, for newer versions tell only changes."""
+        if not math.isnan(duty := self.box.stir_duty):
+            self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
+
+    @property
+    def heard(self) -> bool:
+        """Whether the unit has told what its pins do since we listen."""
+        return self.box.dc_s > -math.inf
 
     def said(self, request: Request) -> float:
         """What the events of a run reported so far, mL."""

@@ -6,20 +6,21 @@ pauses, real seconds, in which the other units go on.
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, Plan
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, flow, regulates, request, target_of
-from hardware.pioreactor.pumps import MEDIA, STEP_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
+from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
-from hardware.pioreactor.versions import facts
+from hardware.pioreactor.versions import TESTED, facts
 from hardware.reactor import Fault
 from hardware.stations import Newest
 
-__all__ = ["Station"]
+__all__ = ["UNHEARD", "Station"]
 
 T = TypeVar("T")
 
@@ -28,6 +29,7 @@ RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those bef
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
+UNHEARD = "the unit told nothing of its pins when one was switched, so no dose could be followed"
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
@@ -89,7 +91,19 @@ class Station:
             "device", device_id=self.name, url=self._web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot
         )
         self.book.log("temperature", temperature=self._target)
+        yield from () if history.open else self.hear_pins()
         self.up = True
+
+    def hear_pins(self) -> Iterator[float]:
+        """Course: switch a pin, that of stirring, until the unit tells it, for at most a minute."""
+        began, own = self._real.now(), not (self._pumps.heard or self._box.live(STIR) or STIR in self._asked_s)
+        with suppress(ReactorError):
+            yield from self._start(STIR) if own else ()
+            while not self._pumps.heard and self._real.now() < began + UNSTARTED_S:
+                if self._calls.due("pins", RESEND_S):
+                    self._pumps.ask_pins()
+                yield STEP_S
+            yield from self._end_job(STIR) if own else ()
 
     def lie_down(self, error: ReactorError, history: History) -> None:
         """It could not be brought up in a run that goes on without it meanwhile: tried again after a while."""
@@ -147,6 +161,8 @@ class Station:
             self.level_ml = math.nan
         if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", RESEND_S):
             self._pumps.ask_pins()
+        if not self._pumps.heard:
+            self._course = self._course or self.hear_pins()
         self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
         self._steer()
 
@@ -202,6 +218,8 @@ class Station:
             word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
             remedy = f"asked for again; a killed job blocks restarts, on the unit: {word}"
             return Fault("stopped", f"the unit {GONE[job]}", remedy)
+        if not self._pumps.heard:
+            return Fault("pump", UNHEARD, f"tried with {', '.join(TESTED)}; look whether stirring runs")
         if self._trouble:
             return Fault("link", self._trouble, "check the unit's web server")
         return None

@@ -4,30 +4,22 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any
 
-__all__ = ["TESTED", "Facts", "facts"]
+__all__ = ["TESTED", "Facts", "facts", "number"]
 
-TESTED = ("25.11.19", "26.7.2")  # versions that the tests run against
+TESTED = ("25.11.19", "26.7.2", "26.11.1")  # versions that the tests run against
 
 
 @dataclass(frozen=True)
 class Facts:
     """What a client of one version must know; the defaults are those of 25.11.12.
 
-    curve_struct: a calibration's curve is {type, coefficients}, not a list. stop_in_body: a stop names its job in a
-    JSON body, not in the query. succeeded: state of a task that is over; failure: HTTP status of one that failed. kept:
-    a task's result can be asked for again. ends: a job that ended at once is a success if its exit code is 0, and else
-    a failure; before, its result was False. purge: command that clears an entry of a cache; forget: that takes a dead
-    job off the list, "" where only a reboot does. target: option, and signal: further ones, of the turbidostat. ledger:
-    the unit keeps the vial's volume, told by MQTT and changed by HTTP, and refuses a dose by it; tube: its name for the
-    level of the efflux tube.
+    curve_struct: a calibration's curve is {type, coefficients}, not a list. purge: command that clears an entry of a
+    cache; forget: that takes a dead job off the list, "" where only a reboot does. target: option, and signal: further
+    ones, of the turbidostat. ledger: the unit keeps the vial's volume, told by MQTT and changed by HTTP, and refuses a
+    dose by it; tube: its name for the level of the efflux tube. What differs in a message is read by its content.
     """
 
     curve_struct: bool = False
-    stop_in_body: bool = False
-    succeeded: str = "complete"
-    failure: int = 500
-    kept: bool = False
-    ends: bool = False
     purge: str = "pio cache clear"
     forget: str = ""
     target: str = "target-od"
@@ -37,18 +29,17 @@ class Facts:
 
 
 CHANGES: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("25.12.10", {"stop_in_body": True, "forget": "pio jobs remove"}),
+    ("25.12.10", {"forget": "pio jobs remove"}),
     ("26.1.30", {"curve_struct": True}),
-    ("26.2.23", {"purge": "pio cache purge", "forget": "pio jobs purge"}),
-    ("26.2.23", {"target": "target-biomass", "signal": (("biomass-signal", "od"),)}),
+    ("26.2.23", {"purge": "pio cache purge", "forget": "pio jobs purge", "target": "target-biomass"}),
+    ("26.2.23", {"signal": (("biomass-signal", "od"),)}),
     ("26.3.0", {"ledger": True}),
     ("26.4.0", {"tube": "efflux_tube_volume_ml"}),
-    ("26.4.3", {"kept": True}),
-    ("26.4.4", {"succeeded": "succeeded", "failure": 200, "ends": True}),
 )
 
 
-def _number(version: str) -> tuple[int, ...]:
+def number(version: str) -> tuple[int, ...]:
+    """By which versions are older or newer."""
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
@@ -59,6 +50,6 @@ def facts(version: str) -> Facts:
     """
     known = Facts()
     for since, changed in CHANGES:
-        if _number(version) >= _number(since):
+        if number(version) >= number(since):
             known = replace(known, **changed)
     return known

@@ -8,7 +8,7 @@ from dataclasses import fields
 
 from hardware.errors import ReactorError
 from hardware.pioreactor.config import RigConfig
-from hardware.rig.build import environment, version
+from hardware.rig.build import environment, newer, version
 from hardware.rig.processes import Rig
 
 
@@ -30,7 +30,7 @@ def main() -> int:
         config = RigConfig(**given)
         if build_only:
             env = environment(config.package, config.folder)
-            print(f"the vendor's software {version(env)} is in {env}")
+            print("\n".join(filter(None, [f"the vendor's software {version(env)} is in {env}", newer()])))
             return 0
         units = {name: float(ml or 20.0) for name, _, ml in (word.partition("=") for word in words)}
         with Rig(units, config, growth_x) as rig:

@@ -2,14 +2,17 @@
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED
+from hardware.pioreactor.versions import TESTED, number
 
-__all__ = ["CACHE", "broker", "environment", "home", "missing", "version"]
+__all__ = ["CACHE", "broker", "environment", "home", "missing", "newer", "version"]
 
 CACHE = Path("~/.cache/turbidostat/pioreactor").expanduser()
 PYTHONS = ("python3.13", "python3.14", "python3.12")
@@ -56,8 +59,20 @@ def missing(package: str = PUBLISHED, folder: str = "") -> str:
     if package.endswith(".whl") and not Path(package).expanduser().is_file():
         return f"no wheel {package}: give the path of one, or a version like {PUBLISHED}"
     if not (home(package, folder) / "done").exists() and _python() is None:
-        return "no Python 3.12 or newer for the vendor's package: pyenv install 3.13"
+        return "no Python 3.12 or newer for the vendor's package, from 26.x on 3.13: pyenv install 3.13"
     return ""
+
+
+def newer() -> str:
+    """A version on the package index that is newer than what was tried, in a line; "" for none, or without network."""
+    ask = [sys.executable, "-m", "pip", "index", "versions", "pioreactor", "--python-version", "3.13", "--retries", "0"]
+    said = subprocess.run(ask, capture_output=True, text=True, check=False).stdout
+    found = re.match(r"pioreactor \(([\d.]+)\)", said)
+    if found is None or number(found[1]) <= number(TESTED[-1]):
+        return ""
+    return (
+        f"version {found[1]} of the vendor's software is on the package index; the newest that was tried: {TESTED[-1]}"
+    )
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:

@@ -47,14 +47,14 @@ def install() -> None:
     mock: Any = importlib.import_module("pioreactor.utils.mock")
     pwm: Any = importlib.import_module("pioreactor.utils.pwm")
     utils, config = importlib.import_module("pioreactor.utils"), importlib.import_module("pioreactor.config").config
-    seen: dict[str, Any] = {"at": -1.0, "lit": False, "volts": 0.0}
+    seen: dict[str, Any] = {"at": -1.0, "volts": 0.0}
 
     def look() -> dict[str, Any]:
         if time.monotonic() - seen["at"] > REUSE_S:
-            with utils.local_intermittent_storage("leds") as leds:
-                lit = float(leds.get(config.get("leds_reverse", "IR"), 0.0)) > 0.0
-            seen.update(at=time.monotonic(), lit=lit, volts=ask({"ask": "volts"}).get("volts", 0.0))
-        return seen
+            seen.update(at=time.monotonic(), volts=ask({"ask": "volts"}).get("volts", 0.0))
+        with utils.local_intermittent_storage("leds") as leds:  # newer versions take dark and lit looks within 0.1 s
+            lit = float(leds.get(config.get("leds_reverse", "IR"), 0.0)) > 0.0
+        return {"lit": lit, "volts": seen["volts"]}
 
     def read(self: Any) -> int:
         state = look()

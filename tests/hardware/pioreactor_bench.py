@@ -17,7 +17,7 @@ from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, U
 from hardware.pioreactor.pumps import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
-from hardware.pioreactor.versions import facts
+from hardware.pioreactor.versions import TESTED, facts
 from hardware.reactor import Command
 from hardware.rig.build import environment, home, missing
 from hardware.rig.processes import Rig
@@ -25,7 +25,8 @@ from hardware.storage.journal import Journal
 
 UNIT, EACH_ML = "pio01", 0.1  # mL: a busy computer is late by 60 ms
 WHEELS = Path(__file__).resolve().parents[2] / "../shared/pioreactor_env"
-PACKAGES = {"25.11.19": PUBLISHED, "26.7.2": str(WHEELS / "26.7.2" / "pioreactor-26.7.2-py3-none-any.whl")}
+PACKAGES = {version: version for version in TESTED}
+PACKAGES["26.7.2"] = str(WHEELS / "26.7.2" / "pioreactor-26.7.2-py3-none-any.whl")
 
 
 def need_the_rig(package: str = PUBLISHED) -> None:
@@ -33,8 +34,8 @@ def need_the_rig(package: str = PUBLISHED) -> None:
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
     if lack := missing(package):
         pytest.skip(f"the vendor's software cannot run here: {lack}", allow_module_level=True)
-    if package == PUBLISHED and not (home(package) / "done").exists():
-        pytest.skip("build it with: python -m hardware.rig --build-only", allow_module_level=True)
+    if package in TESTED and not (home(package) / "done").exists():
+        pytest.skip(f"build it with: python -m hardware.rig --build-only --package {package}", allow_module_level=True)
     try:
         environment(package)
     except DeviceStateError as error:

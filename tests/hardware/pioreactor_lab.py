@@ -1,7 +1,7 @@
 """A unit and its broker in virtual time, as the vendor's software behaves in the rig: what days of faults need.
 
 What a job says and when (init, ready, duty, event, duty off, disconnected), who says all pins again, what a lock, a
-kill -9, a freeze, a power cut and a lost broker leave behind are those of versions 25.11.19 and 26.7.2 as measured in
+kill -9, a freeze, a power cut and a lost broker leave behind are those of the versions that were tried, as measured in
 the rig; docs/pioreactor.md, What is odd in the vendor's software. Written from those measurements, not from the driver.
 """
 
@@ -43,20 +43,21 @@ class World(VirtualClock):
     POST of a dose is answered); kill_after_s, freeze_after_s (after the pump of `strikes` began; frozen for frozen_s),
     stop_after_s (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told);
     dies (a job is over at once); barred (jobs beside the readings do not start); begin_s; unkept (a job that is
-    killed had not yet written down that its pin is on: the chip is told first).
+    killed had not yet written down that its pin is on: the chip is told first); blind (no pins are told).
 
     Attributes: truth, mL by job; level_ml, in the vial when a pump last went on or off; asked, what was asked for.
     """
 
-    def __init__(self, version: str = "26.7.2") -> None:
+    def __init__(self, version: str = "26.11.1") -> None:
         super().__init__(1000.0)
         self.version, self.boot = version, "boot1"
+        self.number, self.duty = tuple(map(int, version.split("."))), "30"
         self.box: Mailbox | None = None
         self.mqtt: Any = None
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self.web = self.queue = self.broker = self.stirs = True
-        self.dies = self.mute = self.barred = self.deaf = self.stands = self.unkept = False
+        self.dies = self.mute = self.barred = self.deaf = self.stands = self.unkept = self.blind = False
         self.locks: set[int] = set()
         self.heard, self.holder, self.begin_s, self.strikes = "yes", "", BEGIN_S, "add_media"
         self.kill_after_s = self.freeze_after_s = self.stop_after_s = np.inf
@@ -94,7 +95,7 @@ class World(VirtualClock):
     def say(self, rest: str, payload: str, retained: bool = False, experiment: str = EXPERIMENT) -> None:
         """A message; `retained`: it comes because somebody subscribes, not because it is said now."""
         topic = f"pioreactor/{UNIT}/{experiment}/{rest}"
-        if rest.endswith(("$state", "dc", "target_temperature", "duty_cycle")) and (self.broker or self.stands):
+        if rest.endswith(("$state", "_dc", "/dc", "target_temperature", "duty_cycle")) and (self.broker or self.stands):
             self.retained[topic] = payload
         if self.broker and self.box is not None:
             self.box.take(topic, payload.encode(), retained)
@@ -104,15 +105,29 @@ class World(VirtualClock):
 
     def pins(self) -> None:
         """All pins of the unit, by whichever process."""
-        self.say("pwms/dc", json.dumps({**self.cache, **({17: 30.0} if self.stirs else {})}))
+        self.say_pins({**self.cache, **({17: 30.0} if self.stirs else {})})
+
+    def say_pins(self, duties: Mapping[int, float], **how: Any) -> None:
+        """In the form of this version, which nobody else may say."""
+        if self.blind:
+            return
+        if self.number < (26, 11):
+            self.say("pwms/dc", json.dumps(duties), **how)
+            return
+        said = {str(channel): duties[pin] for channel, pin in enumerate((17, 13, 16, 12, 18), 1) if pin in duties}
+        self.say("pwms/channel_dc", json.dumps({"timestamp": self.stamp(), "channels": said}), **how)
 
     def stir(self) -> None:
         if self.stirs:
-            self.pins()
+            if self.number < (26, 11):  # a newer one tells changes only
+                self.pins()
             self.later(STIR_S, self.stir)
 
+    def stamp(self) -> str:
+        return f"t{self.now():.3f}/{next(self._order)}"
+
     def event(self, job: str, ml: float, source: str) -> None:
-        body = {"volume_change": ml, "event": job, "source_of_event": source, "timestamp": "t"}
+        body = {"volume_change": ml, "event": job, "source_of_event": source, "timestamp": self.stamp()}
         self.say("dosing_events", json.dumps(body))
 
     @staticmethod
@@ -243,10 +258,13 @@ class World(VirtualClock):
         _, _, _, job, *rest = topic.split("/")
         if job in self.run_now and rest == ["$state", "set"] and self.freeze_after_s == np.inf:
             self.run_now[job][0] = True
-        elif job in ("temperature_automation", "dosing_automation") and rest == ["$state", "set"]:
+        elif job in ("temperature_automation", "dosing_automation", "stirring") and rest == ["$state", "set"]:
             self.later(0.2, lambda: self.over(job))
         elif (job, rest) == ("stirring", ["duty_cycle", "set"]) and self.stirs and not self.deaf:
-            self.later(0.3, self.pins)
+            if payload != self.duty or self.number < (26, 11):
+                self.later(0.3, self.pins)
+            self.duty = payload
+            self.say("stirring/duty_cycle", payload)
         ready = self.retained.get(f"pioreactor/{UNIT}/{EXPERIMENT}/{job}/$state") == "ready"
         if rest == ["target_temperature", "set"] and ready and not self.deaf:
             self.say(f"{job}/target_temperature", payload)
@@ -276,7 +294,8 @@ class World(VirtualClock):
         if job == "temperature_automation":
             self.say(f"{job}/target_temperature", str(options["target-temperature"]))
         if job == "stirring":
-            self.stirs = True
+            self.stirs, self.duty = True, "30"
+            self.pins()
             self.say("stirring/duty_cycle", "30")
             self.stir()
 

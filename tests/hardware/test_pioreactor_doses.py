@@ -9,6 +9,7 @@ import pytest
 from hardware.errors import DeviceStateError, LinkError, RecordingError
 from hardware.pioreactor.pumps import LATE_ML
 from hardware.pioreactor.resume import History, replay
+from hardware.pioreactor.versions import TESTED
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal
 from tests.hardware.pioreactor_lab import FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
@@ -117,7 +118,7 @@ def test_each_dose_of_somebody_else_is_counted_once_as_what_it_is_and_holds_ours
 def test_a_retained_duty_of_another_experiment_is_no_pump_of_ours(monkeypatch, retained):
     lab = Lab(monkeypatch)
     lab.world.retained[f"pioreactor/{UNIT}/older/pwms/dc"] = '{"13": 100.0}'
-    lab.world.say("pwms/dc", '{"13": 100.0}', retained=retained, experiment="older")
+    lab.world.say_pins({13: 100.0}, retained=retained, experiment="older")
     lab.reactors.mqtt.__init__(lab.reactors.config, lab.reactors.mqtt.boxes, "", lab.world)
     lab.begin()
     lab.sample()
@@ -137,7 +138,7 @@ def test_a_word_of_stirring_that_was_overtaken_is_no_pump_that_runs_on(lab, seco
     lab.dose(0.7)
     lab.until(lambda: bool(lab.world.since), 5.0)
     lab.until(lambda: not lab.world.since, 5.0)
-    lab.world.later(seconds, lambda: lab.world.say("pwms/dc", '{"13": 100.0, "17": 30.0}'))
+    lab.world.later(seconds, lambda: lab.world.say_pins({13: 100.0, 17: 30.0}))
     lab.wait(50.0)
     assert lab.fault is None
     assert [row["waste_ml"] for row in lab.of("dose_end")] == [pytest.approx(1.4)]
@@ -220,7 +221,7 @@ def test_what_a_media_pump_gave_too_much_is_drained_also_while_pumps_are_off_and
     assert bool(lab.asked("remove_waste")) is not stops
 
 
-@pytest.mark.parametrize("version", ["25.11.19", "26.7.2"])
+@pytest.mark.parametrize("version", TESTED)
 @pytest.mark.parametrize("away_s", [0.5, 90.0, 9 * 3600.0])
 @pytest.mark.parametrize("pin", [MEDIA_PIN, WASTE_PIN])
 def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypatch, version, away_s, pin):
@@ -294,7 +295,7 @@ def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.0]
 
 
-@pytest.mark.parametrize("version", ["25.11.19", "26.7.2"])
+@pytest.mark.parametrize("version", TESTED)
 def test_the_unit_s_own_ledger_is_put_to_the_level_that_was_read(monkeypatch, version):
     lab = Lab(monkeypatch, World(version))
     lab.begin()

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from hardware.pioreactor.versions import TESTED
 from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World
 
 MEDIA_S, SLACK_ML = 1.4 / FLOW["add_media"], 0.1
 BACK_S = 100.0  # after what was wrong is over, until a dose is possible again
-UNIT_HAS = pytest.mark.parametrize("version", ["25.11.19", "26.7.2"])
+UNIT_HAS = pytest.mark.parametrize("version", TESTED)
 STIRRED = pytest.mark.parametrize("stirring", [True, False], ids=["stirred", "unstirred"])
 
 
@@ -271,7 +272,7 @@ def test_a_killed_job_of_an_earlier_run_is_proven_off_before_the_first_dose(monk
 def test_faults_at_random_moments_leave_a_ledger_that_holds(monkeypatch, seed):
     """One after the other in one run, at moments and for times that nobody chose."""
     rng = np.random.default_rng(seed)
-    lab = Lab(monkeypatch, World(str(rng.choice(["25.11.19", "26.7.2"]))), period_s=60.0)
+    lab = Lab(monkeypatch, World(str(rng.choice(TESTED))), period_s=60.0)
     lab.begin()
     booked = 0.0
     for k in itertools.count():

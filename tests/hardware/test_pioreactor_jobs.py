@@ -19,9 +19,10 @@ from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
-from hardware.pioreactor.versions import facts
+from hardware.pioreactor.station import UNHEARD
+from hardware.pioreactor.versions import TESTED, facts
 from hardware.rig import family as rig
-from tests.hardware.pioreactor_lab import UNIT, Lab, World
+from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
 
 
 @pytest.fixture
@@ -184,6 +185,7 @@ class Said:
 
     def __init__(self, channels: dict[str, str], tube: str) -> None:
         self.settings = {"od_config.photodiode_channel": channels, "bioreactor": {"efflux_tube_volume_ml": tube}}
+        self.settings["PWM"] = {"1": "stirring", "2": "media", "3": "alt_media", "4": "waste", "5": "heating"}
 
     def get(self, path: str, below: str = "/unit_api") -> Any:
         curve = {"curve_data_": {"type": "poly", "coefficients": [0.7, 0.0]}}
@@ -198,7 +200,7 @@ class Said:
     def running(self) -> list[dict[str, Any]]:
         return []
 
-    def run(self, job: str, options: Any) -> str:
+    def run(self, job: str, *_options: Any) -> str:
         return "task"
 
     def result(self, task: str) -> bool:
@@ -222,7 +224,7 @@ def test_photodiode_and_tube_are_judged_by_channel_and_volume_of_their_own_unit(
     units = PioreactorReactors(config, VirtualClock(), bench=Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0}))
     checks = {check.name: check for check in _unit(units.stations[1], units, web)}
     light, volume = checks["pio02 photodiode"], checks["pio02 volume"]
-    assert (light.ok, volume.ok) == ok
+    assert (light.ok, volume.ok, checks["pio02 wiring"].ok, checks["pio02 pins"].ok) == (*ok, True, False)
     assert (light.detail, volume.detail) == (
         f"{channel or '2'} of 1 at 90 degrees",
         f"{tube} mL in its settings, 14 here",
@@ -304,14 +306,35 @@ def test_a_target_is_written_down_once_and_sent_once_and_nan_leaves_it(lab):
 
 
 @pytest.mark.parametrize(("stirring", "thermostat"), [(True, False), (False, True)])
-def test_only_the_jobs_that_a_run_wants_are_started(monkeypatch, stirring, thermostat):
+def test_only_the_jobs_that_a_run_wants_run(monkeypatch, stirring, thermostat):
     lab = Lab(monkeypatch, stirring=stirring, thermostat=thermostat, temperature=31.0)
     lab.begin()
     lab.sample()
     lab.wait(30.0)
-    wanted = {"od_reading", "stirring" if stirring else "temperature_automation"}
+    wanted = {"od_reading", "stirring"} | ({"temperature_automation"} if thermostat else set())
     assert {job for job, options in lab.world.asked if "help" not in options} == wanted
+    assert lab.station._box.live("stirring") is stirring, "switched for a moment, to hear of its pin"
     assert lab.fault is None
+
+
+@pytest.mark.parametrize("stirring", [True, False])
+@pytest.mark.parametrize("version", [*TESTED, "99.1.1"])
+def test_nothing_is_dosed_before_the_unit_told_a_pin_that_was_switched(monkeypatch, version, stirring):
+    """In whatever form; and from then on without a fault."""
+    lab = Lab(monkeypatch, World(version), stirring=stirring)
+    lab.world.blind = True
+    lab.begin()
+    lab.sample()
+    assert (lab.fault.kind, lab.fault.detail) == ("pump", UNHEARD)
+    assert lab.dose(0.5) == 0.0
+    lab.world.blind = False
+    lab.until(lambda: lab.fault is None, 20.0)
+    lab.sample()
+    assert lab.dose(0.5) == 0.5
+    lab.until(lambda: lab.station._box.on() == [MEDIA_PIN], 5.0)
+    lab.until(lambda: lab.station._box.on() == [WASTE_PIN], 5.0)
+    lab.wait(5.0)
+    assert lab.given() == pytest.approx((0.5, 0.5), abs=0.02)
 
 
 def test_a_unit_that_was_given_up_or_handed_over_says_so_of_each_dose(lab):
@@ -378,10 +401,13 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     web: Any = Wrong({"1": "90", "2": "REF", "3": "135"}, "20")
     unit = SimpleNamespace(web=web, config=config.of("pio02"), volume_ml=14.0)
     mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
-    found = list(_unit(SimpleNamespace(name="pio02", unit=unit), SimpleNamespace(config=config, mqtt=mqtt), web))  # type: ignore[arg-type]
+    web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}
+    doses, nothing = SimpleNamespace(pumps=SimpleNamespace(heard=True)), lambda: iter(())
+    station = SimpleNamespace(name="pio02", unit=unit, doses=doses, hear_pins=nothing)
+    found = list(_unit(station, SimpleNamespace(config=config, mqtt=mqtt), web))  # type: ignore[arg-type]
     checks = {check.name.removeprefix("pio02 "): check for check in found}
     assert {name for name, check in checks.items() if not check.ok and check.required} == {
-        "identity", "experiment", "photodiode", "client", "dosing",
+        "identity", "experiment", "photodiode", "wiring", "client", "dosing",
     }  # fmt: skip
     assert {name for name, check in checks.items() if not check.ok and not check.required} == {"version", "clock"}
     assert checks["identity"].detail == "the unit at http://pio02.local is pio09"

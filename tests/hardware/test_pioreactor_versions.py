@@ -19,8 +19,12 @@ import numpy as np
 import pytest
 
 from envs.plant.plant import Plant
-from hardware.pioreactor.config import RigConfig, vial_ml
+from hardware.clock import RealClock
+from hardware.pioreactor.config import PioreactorConfig, RigConfig, vial_ml
+from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.pioreactor.versions import TESTED, Facts, facts
+from hardware.pioreactor.web import NotHeard, Web
+from hardware.rig import build
 from hardware.rig.files import LOGIN, flows
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
 from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig, started
@@ -45,6 +49,7 @@ class Asked:
     def __init__(self, package: str) -> None:
         self.rig = started({UNIT: 14.0}, RigConfig(package=package, od=0.5), experiment="e1")
         self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
+        self.web = Web(self.rig.web[UNIT], "e1", 20.0)
 
     def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
         """Status and content of an answer."""
@@ -58,24 +63,32 @@ class Asked:
             with error:
                 return error.code, error.read()
 
-    def run(self, job: str, options: dict[str, Any] | None = None) -> tuple[int, Any]:
-        """Ask for a job, again as long as the unit has had too many requests for it."""
-        body, said = {"options": options or {}, "env": {"EXPERIMENT": "e1"}}, [(0, None)]
+    def reached(self) -> PioreactorConfig:
+        """How the driver reaches it."""
+        return PioreactorConfig(reactors=(UNIT,), experiment="e1", broker="127.0.0.1", broker_port=self.rig.broker)
+
+    def run(self, job: str, options: dict[str, Any] | None = None) -> str:
+        """Ask for a job, again as long as the unit has had too many requests for it; its task."""
+        tasks: list[str] = []
 
         def taken() -> bool:
-            said.append(self.ask("POST", f"/unit_api/jobs/run/job_name/{job}", body))
-            return said[-1][0] != 429
+            try:
+                tasks.append(self.web.run(job, options or {}))
+            except NotHeard as error:
+                if "status 429" not in str(error):
+                    raise
+            return bool(tasks)
 
         assert until(taken)
-        return said[-1]
+        return tasks[0]
 
-    def finished(self, task: str) -> tuple[int, Any]:
-        """The answer of a task that is over."""
-        said = [(0, None)]
+    def finished(self, task: str) -> bool | None:
+        """What the driver makes of a task that is over."""
+        said: list[bool | None] = []
 
         def over() -> bool:
-            said.append(self.ask("GET", f"/unit_api/task_results/{task}"))
-            return said[-1][0] != 202
+            said.append(self.web.result(task))
+            return said[-1] is not None
 
         assert until(over)
         return said[-1]
@@ -88,12 +101,6 @@ class Asked:
         """Of a running job; none of one that does not run."""
         status, said = self.ask("GET", f"/unit_api/jobs/settings/job_name/{job}")
         return said["settings"] if status == 200 else {}
-
-    def stop(self, job: str, in_body: bool) -> int:
-        """Status of a stop that names its job in the body, or in the query."""
-        if in_body:
-            return self.ask("POST", "/unit_api/jobs/stop", {"job_name": job})[0]
-        return self.ask("POST", f"/unit_api/jobs/stop?job_name={job}")[0]
 
     def fed_ml(self) -> float:
         return float(self.vial.plant.feed.delivered_ml[0])
@@ -152,50 +159,55 @@ def test_all_that_runs_on_a_bench_runs_here(unit):
 
 
 @rig
-def test_a_dose_reaches_the_vial_and_its_task_says_what_the_table_says(unit):
+def test_a_dose_reaches_the_vial_and_its_task_is_a_success(unit):
     before, had = unit.fed_ml(), len(unit.vial.pulses)
-    status, said = unit.run("add_media", {"ml": 0.4})
-    assert status == 202
+    task = unit.run("add_media", {"ml": 0.4})
     assert until(lambda: len(unit.vial.pulses) > had)
     assert unit.fed_ml() - before == pytest.approx(0.4, abs=EACH_ML)
-    status, told = unit.finished(said["task_id"])
-    assert (status, told["status"]) == (200, unit.known.succeeded)
-    again = unit.ask("GET", f"/unit_api/task_results/{said['task_id']}")
-    assert (again[0] == 200) is unit.known.kept
+    assert unit.finished(task) is True
 
 
 @rig
-def test_a_task_whose_job_cannot_start_fails_as_the_table_says(unit):
+def test_a_task_whose_job_cannot_start_has_failed(unit):
     """Older versions look for half a second, in which their command may not end: a shell gives its status."""
-
-    def ends(job: str, options: dict[str, Any], as_told: Callable[[int, dict[str, Any]], bool]) -> bool:
-        time.sleep(1.0)  # one request a second for each job
-        return as_told(*unit.finished(unit.run(job, options)[1]["task_id"]))
-
-    def failed(status: int, told: dict[str, Any]) -> bool:
-        if unit.known.ends:
-            return (status, told["status"]) == (unit.known.failure, "failed")
-        return (status, told["status"], told["result"]) == (200, unit.known.succeeded, False)
-
-    well = {"ok": True} if unit.known.ends else False
     wrong, help_ = (unit.pio(f"pio run {words}") for words in ("add_media --no-such-option 1", "remove_waste --help"))
     assert (wrong != 0, help_) == (True, 0)
     with unit.at_once({"--no-such-option": wrong, "--help": help_}):
-        assert until(lambda: ends("add_media", {"no-such-option": 1}, failed))
-        assert until(lambda: ends("remove_waste", {"help": None}, lambda _, told: told["result"] == well))
+        assert until(lambda: unit.finished(unit.run("add_media", {"no-such-option": 1})) is False)
+        unit.finished(unit.run("remove_waste", {"help": None}))
 
 
 @rig
-def test_a_stop_names_its_job_where_the_version_looks_for_it(unit):
+def test_a_stop_ends_its_job(unit):
     before = unit.fed_ml()
     unit.run("add_media", {"duration": 60.0})
     assert until(unit.pumping)
-    assert unit.stop("add_media", in_body=not unit.known.stop_in_body) == 400
-    assert unit.pumping()
-    assert unit.stop("add_media", in_body=unit.known.stop_in_body) == 202
+    unit.web.stop("add_media")
     assert until(lambda: not unit.pumping())
     assert unit.fed_ml() - before < 60.0
     assert until(lambda: "add_media" not in unit.jobs())
+
+
+@rig
+def test_each_pump_is_told_by_the_pin_of_its_channel(unit):
+    """And stirring tells all pins again when its duty is changed a little."""
+    box = Mailbox(UNIT, PioreactorConfig(experiment="e1"), RealClock())
+    cluster = Cluster(unit.reached(), {UNIT: box}, "test", RealClock())
+    try:
+        assert until(lambda: cluster.connected)
+        unit.run("stirring")
+        assert until(lambda: box.stir_duty > 0.0)
+        for k in range(2):
+            at = box.dc_s
+            cluster.publish(f"pioreactor/{UNIT}/e1/stirring/duty_cycle/set", f"{30.51 + 0.01 * k:g}")
+            assert until(lambda at=at: box.dc_s > at)
+        for job, pin in (("add_media", 13), ("remove_waste", 12)):
+            unit.run(job, {"duration": 2.0})
+            assert until(lambda pin=pin: box.on() == [pin])
+            assert until(lambda: not box.on())
+            assert box.pins[pin].ran_s == pytest.approx(2.0, abs=1.0)
+    finally:
+        cluster.close()
 
 
 @rig
@@ -205,8 +217,7 @@ def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_comma
     for pid in unit.rig.jobs(UNIT, "add_media"):
         os.kill(pid, signal.SIGKILL)
     had = len(unit.vial.pulses)
-    locked = unit.run("add_media", {"duration": 0.1})[1]["task_id"]
-    unit.finished(locked)
+    unit.finished(unit.run("add_media", {"duration": 0.1}))
     assert unit.pumping(), "a chip drives it on"
     wrong = {"pio cache clear", "pio cache purge"} - {unit.known.purge}
     assert unit.pio(f"{wrong.pop()} pwm_locks {MEDIA} --as-int") == 2, "no such command"
@@ -226,7 +237,7 @@ def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_comma
 def test_a_turbidostat_takes_the_option_of_the_table_and_no_other(unit):
     name = {"automation-name": "turbidostat", "exchange-volume-ml": 1.0}
     (other,) = TARGETS - {unit.known.target}
-    unit.finished(unit.run("dosing_automation", name | {other: 9.0})[1]["task_id"])
+    unit.finished(unit.run("dosing_automation", name | {other: 9.0}))
     assert until(lambda: "dosing_automation" not in unit.jobs())
     unit.run("dosing_automation", name | {unit.known.target: 9.0} | dict(unit.known.signal))
     assert until(lambda: unit.settings("dosing_automation").get("$state") == "ready")
@@ -235,7 +246,7 @@ def test_a_turbidostat_takes_the_option_of_the_table_and_no_other(unit):
     assert {option.replace("-", "_"): said.get(option.replace("-", "_")) for option, _ in unit.known.signal} == {
         option.replace("-", "_"): value for option, value in unit.known.signal
     }
-    assert unit.stop("dosing_automation", unit.known.stop_in_body) == 202
+    unit.web.stop("dosing_automation")
     assert until(lambda: "dosing_automation" not in unit.jobs())
 
 
@@ -250,7 +261,8 @@ def test_the_unit_keeps_a_ledger_that_can_be_set_where_the_table_says_so(unit):
     assert unit.ask("PATCH", route, {"values": {"current_volume_ml": 14.5}})[0] == 200
     assert unit.ask("GET", route)[1]["values"]["current_volume_ml"] == 14.5
     before = unit.fed_ml()
-    assert unit.run("add_media", {"ml": 3.5})[0] == 400, "18 mL is the most in a vial of 20"
+    with pytest.raises(NotHeard, match="status 400"):  # 18 mL is the most in a vial of 20
+        unit.run("add_media", {"ml": 3.5})
     assert unit.fed_ml() == before
 
 
@@ -351,13 +363,26 @@ def test_the_vendor_s_estimate_from_the_plate_s_cooling_is_the_vial_s_temperatur
 
 def test_the_table_is_read_from_its_first_row_to_the_version_s():
     """A version is newer by its numbers, not by its letters."""
-    newest, oldest = facts("26.7.2"), Facts()
+    newest, oldest = facts(TESTED[-1]), Facts()
     assert {facts(v) for v in ("26.10.0", "26.10.1", "27.1.0rc1", "100.1.1")} == {newest}
     assert {facts(v) for v in ("25.11.19", "", "9.12.31", "unnamed")} == {oldest}
-    assert (facts("25.12.10").stop_in_body, facts("25.12.10").curve_struct) == (True, False)
+    assert (facts("25.12.10").forget != "", facts("25.12.10").curve_struct) == (True, False)
     assert [facts(v).purge for v in ("26.2.9", "26.2.23")] == ["pio cache clear", "pio cache purge"]
     assert [facts(v).tube for v in ("26.3.12", "26.4.0")] == [oldest.tube, newest.tube]
-    assert [facts(v).succeeded for v in ("26.4.3", "26.4.4", "26.4.10")] == ["complete", "succeeded", "succeeded"]
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("pioreactor (99.1.0)\nAvailable versions: 99.1.0, 26.11.1", "99.1.0"),
+        (f"pioreactor ({TESTED[-1]})", ""),
+        ("", ""),
+    ],
+)
+def test_a_newer_version_on_the_package_index_is_told_in_a_line_and_nothing_without_network(monkeypatch, said, told):
+    monkeypatch.setattr(build.subprocess, "run", lambda *_given, **_how: subprocess.CompletedProcess([], 1, said, ""))
+    line = build.newer()
+    assert (told in line, bool(line), "\n" in line) == (True, bool(told), False)
 
 
 @pytest.mark.parametrize(("volume_ml", "vial"), [(14.0, 20), (20.0, 40), (35.0, 40)])
