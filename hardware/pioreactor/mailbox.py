@@ -54,15 +54,16 @@ class Pin:
     """A pump's pin by the messages about it.
 
     Attributes: on; on_s, off_s, when it last went on and off, -inf if that is not known; ran_s, for how long it has run
-      up to off_s; run_s, ended_s, when a job of the pump last said that it is there, and that it ended; event_s, when
-      it first told what it is about to give, inf if it did not; doubt_s, when it was said to be on though its job had
-      ended.
+      up to off_s; inits, when processes of its job began; run_s, ended_s, when one last said that it is there, and that
+      it ended; event_s, when it first told what it is about to give, inf if it did not; doubt_s, when it was said to be
+      on though its job had ended.
     """
 
     def __init__(self) -> None:
         self.on, self.ran_s = False, 0.0
         self.on_s = self.off_s = self.run_s = self.ended_s = self.doubt_s = -math.inf
         self.event_s = math.inf
+        self.inits = deque[float](maxlen=8)
 
     def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
         """A message that has all pins of the unit.
@@ -182,6 +183,8 @@ class Mailbox:
         if at == -math.inf or job not in self.jobs:
             return
         pin = self.pins[self.jobs[job]]
+        if word == "init":
+            pin.inits.append(at)
         if word == "init" or (word in LIVE and known.word not in LIVE):
             pin.run_s = at
         elif word == "disconnected":

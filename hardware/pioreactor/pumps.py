@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from hardware.clock import Clock
 from hardware.errors import ReactorError
@@ -19,7 +19,7 @@ from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
 from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Request", "Steps", "boot_of"]
+__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Request", "Seen", "Steps", "boot_of", "is_off"]
 
 T = TypeVar("T")
 
@@ -275,11 +275,21 @@ class Pumps:
             self.trouble, self.waits = "", False
         return why
 
+    def last_word(self, request: Request) -> str:
+        """What the job of a run last said of itself, "" while that is unknown.
+
+        Two processes of one name say it by one topic; over a broken connection nobody knows whose it was.
+        """
+        pin, state = self.pin(request.job), self.box.state(request.job)
+        alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
+        return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
+
     def _is_over(self, request: Request) -> bool:
         """Whether a job has said that it ended, its pin stands still, and its last event is there or will not come."""
-        state, now = self.box.state(request.job), self.clock.now()
-        ended = state.word == "disconnected" and state.at >= request.asked_s and not self.pin(request.job).on
-        return ended and (self.said(request) >= request.ml - 1e-6 or now > state.at + SETTLE_S)
+        state, pin, asked_s = self.box.state(request.job), self.pin(request.job), request.asked_s
+        told = pin.on_s >= asked_s and state.word == "disconnected" and state.at >= asked_s  # whoever's word that was
+        ended = (told or self.last_word(request) == "disconnected") and not pin.on
+        return ended and (self.said(request) >= request.ml - 1e-6 or self.clock.now() > state.at + SETTLE_S)
 
     def _moved(self, request: Request) -> Moved:
         """What a job that ended by itself gave, by its events and by how long its pin was on."""
@@ -329,6 +339,32 @@ class Pumps:
         )
 
 
+class Seen(NamedTuple):
+    """What is known of a pump that is to be off.
+
+    boot: its unit was started since. pin: "on" or "off" as told since, "" untold. short: of a run asked for to switch
+    it off, "asked", or "ended" by its own event and what its job said after it; "" before. word: as of `last_word`.
+    """
+
+    boot: bool
+    pin: str
+    short: str
+    word: str
+
+
+PROOFS: tuple[dict[str, tuple[Any, ...]], ...] = (
+    {"boot": (True,)},  # which sets all pins to 0
+    {"short": ("ended",), "pin": ("off", "")},  # it set the pin to 0 as it began and as it ended
+    {"short": ("",), "word": ("disconnected",), "pin": ("off",)},  # later words may be those of the short run
+)
+"""What proves a pump off: each of a row's values is among those that it names."""
+
+
+def is_off(seen: Seen) -> bool:
+    """Whether that proves a pump off."""
+    return any(all(getattr(seen, key) in values for key, values in row.items()) for row in PROOFS)
+
+
 class ForcedEnd:
     """One pump on its way to being proven off: what is tried, and what proves it.
 
@@ -364,57 +400,53 @@ class ForcedEnd:
             p.ask_pins()
         if passed > 2.0 and self._listed is not False:
             calls.ask("stop", 20.0, p.web.stop, job)
-        may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
         if self._short is not None and self._short.done():
             if not isinstance(self._short.exception(), NotHeard):
                 self._barrier = Barrier(p.web, p.clock, AGAIN_S)
             self._short = None
-        heard = p.mqtt.connected  # what it tells, else it runs unseen
-        if (
-            self._short is None
-            and passed > 5.0
-            and may_run
-            and heard
-            and self._barrier.passed()
-            and calls.due("short", 2.0)
-        ):
+        may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
+        may_run = may_run and p.mqtt.connected and self._short is None  # what it tells, else it runs unseen
+        if may_run and passed > 5.0 and self._barrier.passed() and calls.due("short", 2.0):
             self._short_s = min(self._short_s, p.clock.now())
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
-    def off_s(self) -> float:
-        """When the pump was off at the latest, nan while that is not proven."""
-        p, now, pin, state = self._p, self._p.clock.now(), self._p.pin(self._job), self._p.box.state(self._job)
-        broke = p.broke(self._request)  # a broker that stood still takes jobs that live for lost
-        self._lost = self._lost or (state.word == "lost" and not broke)
+    def _look(self) -> Seen:
+        """What is known now."""
+        p, pin, state = self._p, self._p.pin(self._job), self._p.box.state(self._job)
+        self._lost = self._lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
-        if now > p.box.heard_s + QUIET_S:
+        if p.clock.now() > p.box.heard_s + QUIET_S:
             self._quiet_s = min(self._quiet_s, p.box.heard_s)
-        fresh, said = p.box.dc_s > self.began, state.word == "disconnected" and state.at >= self._since
-        if fresh and not pin.on and pin.doubt_s == -math.inf and not self._untold:
+        told = "off" if p.box.dc_s > self.began and pin.doubt_s == -math.inf else ""
+        if told and not pin.on and not self._untold:
             self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
-            self._rows_s = now
+            self._rows_s = p.clock.now()
             self._listed = any(row["job_name"] == self._job for row in rows[0])
             self._rebooted = not self._listed and p.rebooted(rows[0])
-            if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
-                p.boot, off_s = boot_of(rows[0]), max(min(self._quiet_s, now), self._since)
-                pin.ends(off_s)
-                return off_s
-        by_itself = said and not self._lost and (fresh or pin.off_s >= self._since)
-        by_short = said and self._shorts() > self._shorts_before and state.at >= self._short_s
-        if pin.on or not (by_itself or by_short or (self._listed is False and fresh and not self._untold)):
+            p.boot = boot_of(rows[0]) if self._rebooted else p.boot
+        ended = self._shorts() > self._shorts_before and state.word == "disconnected"
+        short = "" if math.isinf(self._short_s) else "ended" if ended else "asked"
+        told = "on" if pin.on else told or ("off" if pin.off_s >= self._since else "")
+        return Seen(self._rebooted, told, short, p.last_word(self._request))
+
+    def off_s(self) -> float:
+        """When the pump was off at the latest, nan while that is not proven."""
+        pin, now = self._p.pin(self._job), self._p.clock.now()
+        if not is_off(self._look()):
             return math.nan
+        if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
+            pin.ends(max(min(self._quiet_s, now), self._since))
         return pin.off_s if pin.off_s >= self._since else now
 
     @property
     def _untold(self) -> bool:
-        """Whether the job of a dose was killed and its pin was not said to be on.
+        """Whether the pin of a dose that had to be ended was not said to be on.
 
-        The chip is told first, the unit and we an instant later: until a short run, what others say of the pin may be
-        what was before.
+        The vendor's job switches the pin before it publishes that: what others publish may be stale.
         """
         heard = self._since <= self._p.pin(self._job).on_s < self._short_s
-        return self._lost and self._request.ml > 0.0 and not heard
+        return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
         """What a pump that runs on, or told that it is about to and no end, moved up to now, mL; 0 for one of a silent

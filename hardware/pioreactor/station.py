@@ -54,7 +54,7 @@ class Station:
         self.given_up = self.heat_is_off = self.up = False
         self._calls = Calls(self._web, self._real)
         self._course: Iterator[float] | None = None
-        self._gone, self._been, self._missing = set[str](), set[str](), list[str]()
+        self._gone, self._been, self._ended, self._missing = set[str](), set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
         self._listed = set[str]()
         self._target_sent_s, self._target_sends, self._trouble = math.inf, 0, ""
@@ -216,7 +216,8 @@ class Station:
         if self._missing:
             forget, job = self._pumps.facts.forget, self._missing[0]
             word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
-            remedy = f"asked for again; a killed job blocks restarts, on the unit: {word}"
+            again = "it ended twice, start it in the vendor's page" if job in self._ended else "asked for again"
+            remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
             return Fault("stopped", f"the unit {GONE[job]}", remedy)
         if not self._pumps.heard:
             return Fault("pump", UNHEARD, f"tried with {', '.join(TESTED)}; look whether stirring runs")
@@ -247,19 +248,20 @@ class Station:
     def _is_gone(self, job: str) -> bool:
         """Whether a job should run and does not: readings stopped in whatever way; others killed, or never there.
 
-        It is asked for again, and again; until it is there it is gone. What somebody stopped in the vendor's page stays
-        stopped.
+        It is asked for again, and again; until it is there it is gone. One that said itself that it ended, whoever did
+        that, is asked for once.
         """
         if self._there(job):
             self._gone.discard(job)
             self._been.add(job)
             return False
-        due = self._asked_s.get(job, -math.inf) + GRACE_S
-        stopped = self._box.state(job).word == "disconnected" and job in self._been
-        if (job == OD or not stopped) and self._real.now() > due:
+        if self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S:
             self._gone.add(job)
             self._asked_s[job] = self._real.now()
-            self._course = self._course or self._again(job)
+            ended = job != OD and self._box.state(job).word == "disconnected" and job in self._been
+            if not (ended and job in self._ended):
+                self._course = self._course or self._again(job)
+            self._ended |= {job} if ended else set()
         return job in self._gone
 
     def _again(self, job: str) -> Iterator[float]:

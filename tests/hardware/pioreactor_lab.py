@@ -43,7 +43,7 @@ class World(VirtualClock):
     POST of a dose is answered); kill_after_s, freeze_after_s (after the pump of `strikes` began; frozen for frozen_s),
     stop_after_s (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told);
     dies (a job is over at once); barred (jobs beside the readings do not start); begin_s; unkept (a job that is
-    killed had not yet written down that its pin is on: the chip is told first); blind (no pins are told).
+    killed or frozen had not yet written down that its pin is on: the chip is told first); blind (no pins are told).
 
     Attributes: truth, mL by job; level_ml, in the vial when a pump last went on or off; asked, what was asked for.
     """
@@ -183,9 +183,9 @@ class World(VirtualClock):
                 self.pins() if late <= 0.0 else self.later(late, tell)
 
         kill = np.inf if short or job != self.strikes else self.kill_after_s
-        if kill < np.inf and self.unkept:
-            self.cache.pop(PINS[job])
         freeze = np.inf if short or job != self.strikes else self.freeze_after_s
+        if min(kill, freeze) < np.inf and self.unkept:
+            self.cache.pop(PINS[job])
         stop = np.inf if job != self.strikes else self.stop_after_s
 
         def slice_() -> None:

@@ -5,12 +5,13 @@ again within a stated time after what was wrong is over.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from hardware.pioreactor.pumps import Seen, is_off
 from hardware.pioreactor.versions import TESTED
 from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World
 
@@ -110,6 +111,10 @@ WRONG = {
     ),
     **{f"frozen {s:g} s": Wrong(frozen(0.01, s), s, told="pin 13" if s > 8.0 else "") for s in (0.01, 1.0, 7.0, 14.0)},
     **{f"frozen {s:g} s in it": Wrong(frozen(0.6, s), s, told="pin 13") for s in (20.0, 60.0)},
+    "frozen 60 s before its unit knew": Wrong(frozen(0.01, 60.0, unkept=True), 60.0, told="pin 13"),
+    "frozen before its unit knew, and somebody's request refused": Wrong(
+        both(frozen(0.01, 60.0, unkept=True), theirs), 60.0, told="pin 13"
+    ),
     "broker lost": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3.0)), 3.0),
     "broker lost for an hour": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3600.0)), 3600.0, told="no MQTT"),
     "broker frozen": Wrong(in_the_dose(lambda lab: lab.world.freeze_broker(25.0)), 25.0, told="no MQTT"),
@@ -143,6 +148,34 @@ WRONG = {
     "ends 1 s late": Wrong(world(late_s=1.0), gives=1.4 + FLOW["add_media"]),
     "somebody's request refused in it": Wrong(in_the_dose(theirs), gives=1.4),
 }
+
+
+PIN, SHORT, WORD = ("on", "off", ""), ("", "asked", "ended"), ("", "ready", "disconnected", "lost")
+
+
+def units() -> Iterator[tuple[Seen, bool]]:
+    """What may be seen of every unit that there can be, and whether its pump runs.
+
+    Its job has ended, stands still or was killed. The chip was told of its pin before anybody else. A short run that
+    finds a lock says "disconnected", too, of the same job; a broker takes jobs that live for lost.
+    """
+    for pin, short, word in itertools.product(PIN, SHORT, WORD):
+        yield Seen(True, pin, short, word), False
+    words = {"over": {"", "disconnected", "lost"}, "stands": {"", "ready", "lost"}, "killed": {"", "lost"}}
+    for (job, said), short in itertools.product(words.items(), SHORT):
+        runs = job != "over" and short != "ended"
+        for pin, word in itertools.product(PIN if runs else ("off", ""), said | ({"disconnected"} if short else set())):
+            yield Seen(False, pin, short, word), runs
+
+
+def test_no_state_proves_a_pump_off_that_may_run_and_every_other_leads_to_one_that_does() -> None:
+    running, resting = ({seen for seen, runs in units() if runs is it} for it in (True, False))
+    for seen in map(Seen._make, itertools.product((False, True), PIN, SHORT, WORD)):
+        assert not (is_off(seen) and seen in running), seen
+    for seen in resting - running:
+        assert is_off(seen._replace(short="ended", pin="off")), seen
+        assert is_off(seen._replace(boot=True)), seen
+    assert is_off(Seen(False, "off", "", "disconnected")), "a dose that ended by itself needs no short run"
 
 
 def settle(lab: Lab) -> None:

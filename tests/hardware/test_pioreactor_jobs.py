@@ -97,11 +97,18 @@ def test_a_unit_that_was_given_up_is_regulated_by_nobody_any_more(lab):
     assert len(started(lab, "dosing_automation")) == 1
 
 
-def test_what_somebody_stops_in_the_vendors_page_stays_stopped(lab):
-    lab.world.over("stirring")
-    lab.wait(60.0)
-    assert lab.fault is None
-    assert len(started(lab, "stirring")) == 1
+@pytest.mark.parametrize("job", ["stirring", "temperature_automation"])
+def test_what_ends_by_itself_is_told_and_started_again_once_and_held_after_that(lab, job):
+    """Or because somebody stopped it in the vendor's page."""
+    for held in (False, True, True):
+        lab.world.over(job)
+        lab.until(lambda: lab.fault is not None, 60.0)
+        assert lab.fault.kind == "stopped"
+        lab.wait(300.0)
+        assert (len(started(lab, job)), lab.fault is not None, lab.dose(0.5) == 0.0) == (2, held, held)
+        if held:
+            lab.world.ready(job, {"target-temperature": 30.0})
+            lab.until(lambda: lab.fault is None, 10.0)
 
 
 def test_a_target_told_while_the_thermostat_starts_is_told_again(lab):
