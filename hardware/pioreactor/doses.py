@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
-from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, WASTE, Moved, Pumps, Request, Steps
+from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, WASTE, Moved, Pumps, Request, Steps
 from hardware.pioreactor.resume import History
 from hardware.storage.doses import Ending, Given
 
@@ -46,6 +46,8 @@ class Doses:
         self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
+        self._ran_s, self._strange_ml = {MEDIA: 0.0, WASTE: 0.0}, {MEDIA: 0.0, WASTE: 0.0}
+        self._rest_ml = 0.0, 0.0, 0.0
 
     @property
     def running(self) -> bool:
@@ -102,6 +104,7 @@ class Doses:
     def work(self) -> None:
         """Do what is due; called again and again."""
         if self._course is None:
+            self._settle_pins()
             self._course = next((self._silence(job) for job in (MEDIA, WASTE) if self.pumps.odd(job)), None)
         if self._course is None or self._clock.now() < self._due:
             return
@@ -109,6 +112,7 @@ class Doses:
             self._due = self._clock.now() + next(self._course)
         except StopIteration:
             self._course, self.ended_s = None, self._clock.now()
+            self._ran_s = {job: self.pumps.pin(job).ran_s for job in self._ran_s}
             self._settle_strange()
 
     def take(self, events: list[Event]) -> None:
@@ -163,9 +167,14 @@ class Doses:
         self._book.log("dose_end", **row, waste_high_ml=high_ml, id=dose, end=end)
         if media.high > plan.feed_ml + LATE_ML:
             taken += yield from self._drain(media, dose)
-        more, rise = media.high - plan.feed_ml, max(min(media.high, self._room_ml) - taken, 0.0)
-        if abs(more) > LATE_ML or rise > LATE_ML or media.low < plan.feed_ml - LATE_ML:
-            self.extra.append(Given(self._book.elapsed(), more, media.low - plan.feed_ml, more - rise))
+        rise, now_ml = (
+            max(min(media.high, self._room_ml) - taken, 0.0),
+            (media.high - plan.feed_ml, media.low - plan.feed_ml),
+        )
+        more, less, rise = self._rest_ml = tuple(map(sum, zip(self._rest_ml, (*now_ml, rise), strict=True)))
+        if max(abs(more), abs(less), rise) > LATE_ML:  # little is booked once it is much
+            self.extra.append(Given(self._book.elapsed(), more, less, more - rise))
+            self._rest_ml = 0.0, 0.0, 0.0
 
     def _drain(self, media: Moved, dose: str) -> Steps[float]:
         """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out, mL."""
@@ -189,6 +198,17 @@ class Doses:
             taken = moved.drained + (yield from self._drain(moved, name))
             self.extra.append(Given(self._book.elapsed(), 0.0, 0.0, taken))
 
+    def _settle_pins(self) -> None:
+        """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too."""
+        for job in (MEDIA, WASTE):
+            pin, now = self.pumps.pin(job), self._clock.now()
+            if self.pumps.odd(job) or not (pin.on or self.pumps.box.driven(job) or now < pin.off_s + SETTLE_S):
+                ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
+                self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
+                if ran_ml > LATE_ML:
+                    self.foreign = f"{job} of {ran_ml:.2f} mL by its pin, without our command"
+                    self._give(job, ran_ml, ran_ml, self.foreign)
+
     def _settle_strange(self) -> None:
         """Book what was dosed without a command of this run, beyond what was counted already."""
         strange, self._strange = self._strange, []
@@ -199,6 +219,7 @@ class Doses:
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
             self.pumps.counted[job, source] = counted + over
+            self._strange_ml[job] = self._strange_ml.get(job, 0.0) + over
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
                 continue

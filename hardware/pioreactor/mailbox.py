@@ -15,13 +15,14 @@ from hardware.clock import Clock
 from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
 
-__all__ = ["CHANNELS", "DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
+__all__ = ["AUTOMATIONS", "CHANNELS", "DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
 
 KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
-MOST_ML = 10.0  # an event tells half a second of a pump
+MOST_ML = 100.0  # no event tells more: half a second of a pump, or what a pump gave that stood still
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
 PUMPS = ("add_media", "add_alt_media", "remove_waste")  # jobs, in the order of config.pump_pins
-DOSING_JOBS = (*PUMPS, "circulate_media", "circulate_alt_media", "pumps", "dosing_automation")
+AUTOMATIONS = ("circulate_media", "circulate_alt_media", "pumps", "dosing_automation")  # drive several pumps
+DOSING_JOBS = (*PUMPS, *AUTOMATIONS)
 LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
 ECHOES = ("stirring", "temperature_automation")  # jobs that say all pins of the unit now and then
 CHANNELS = {"1": 17, "2": 13, "3": 16, "4": 12, "5": 18}  # GPIO pin of each PWM channel of the vendor's board
@@ -114,6 +115,7 @@ class Mailbox:
         self.readings: deque[Reading] = deque(maxlen=KEPT)
         self.events: deque[Event] = deque(maxlen=KEPT)
         self.ignored: list[str] = []
+        self._heard = deque[bytes](maxlen=100)
         self.jobs = dict(zip(PUMPS, config.pump_pins, strict=True))
         self.pins = {pin: Pin() for pin in config.pump_pins}
         self.states: dict[tuple[str, str], State] = {}
@@ -151,12 +153,13 @@ class Mailbox:
             duty = {int(pin): _number(dc) for pin, dc in said.items()}
             echoes = not mine or any(map(self.live, ECHOES))
             for job, number in self.jobs.items():
-                word = next((w for w in LIVE if self.live(job)), self.state(job).word)
+                word = LIVE[0] if self.driven(job) else self.state(job).word
                 on = duty.get(number, 0.0) > 0.0
                 self.pins[number].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
             self.dc_s = max(self.dc_s, at)
-        elif rest == "dosing_events" and not retained:
+        elif rest == "dosing_events" and not retained and payload not in self._heard:  # a bridge brings one twice
             e = json.loads(payload)
+            self._heard.append(payload)
             if not isinstance(e["event"], str):
                 raise TypeError("an event without a name")
             event = Event(e["event"], _number(e["volume_change"]), str(e["source_of_event"]))
@@ -230,6 +233,10 @@ class Mailbox:
         with self.lock:
             known = [(e, s) for (e, name), s in self.states.items() if name == job]
         return any(s.word in LIVE and (e == self._experiment or s.at > -math.inf) for e, s in known)
+
+    def driven(self, job: str) -> bool:
+        """Whether a job is there that drives a pump: its own, or one that drives several."""
+        return any(map(self.live, (job, *AUTOMATIONS)))
 
     def on(self) -> list[int]:
         """Pins that run by what the unit said last."""

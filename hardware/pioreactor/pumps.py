@@ -167,7 +167,7 @@ class Pumps:
     def odd(self, job: str) -> bool:
         """Whether a pump has to be ended: it runs without a job, or its job was lost and it is not proven off since."""
         pin, new = self.pin(job), self.box.state(job).at > self.proven.get(job, -math.inf) or job not in self.proven
-        runs_on = pin.on and not self.box.live(job) and self.clock.now() > max(pin.on_s, pin.ended_s) + SETTLE_S
+        runs_on = pin.on and not self.box.driven(job) and self.clock.now() > max(pin.on_s, pin.ended_s) + SETTLE_S
         return runs_on or (self.lost(job) and new)
 
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, Plan
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, flow, regulates, request, target_of
+from hardware.pioreactor.mailbox import AUTOMATIONS
 from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
@@ -209,8 +210,9 @@ class Station:
         if other := self._mqtt.holder(self.name):
             who, _, done = other.partition("; ")
             return Fault("mode", who, done)
-        if self._box.live(AUTOMATION) and not self.handed_over:
-            return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
+        theirs = [job for job in AUTOMATIONS if self._box.live(job)]
+        if theirs and not (self.handed_over and theirs == [AUTOMATION]):
+            return Fault("mode", f"{theirs[0]} of the vendor's runs", "stop it in the vendor's page; it is counted")
         if self.doses.foreign and not self.handed_over:
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
         if self._missing:

@@ -216,6 +216,23 @@ class World(VirtualClock):
         slice_()
         self.later(0.015, tell)
 
+    def circulate(self, seconds: float) -> None:
+        """The vendor's job that runs waste, and media now and then, and tells nothing of what media gave."""
+        job, end = "circulate_media", self.now() + seconds
+
+        def spell(on: bool) -> None:
+            self.pin("add_media", on)
+            if self.now() < end or on:
+                self.later(0.8, lambda: spell(not on))
+            else:
+                self.pin("remove_waste", False)
+                self.over(job)
+
+        self.state(job, "ready")
+        self.event("remove_waste", 20.0, "CLI")
+        self.pin("remove_waste", True)
+        spell(True)
+
     def _ends(self, job: str, me: list[Any], really: float | None, told: list[float]) -> None:
         """A job ends by itself or by MQTT: pin off, then the correction of what was told."""
         del self.run_now[job]

@@ -148,6 +148,42 @@ def test_a_word_of_stirring_that_was_overtaken_is_no_pump_that_runs_on(lab, seco
     assert not [options for _, options in lab.world.asked if "duration" in options]
 
 
+def test_what_a_job_of_several_pumps_gives_is_told_booked_by_its_pins_and_left_to_its_end(lab):
+    lab.world.circulate(30.0)
+    lab.wait(29.0)
+    assert (lab.fault.kind, "circulate_media" in lab.fault.detail) == ("mode", True)
+    assert lab.dose(0.5) == 0.0
+    lab.wait(10.0)
+    assert lab.given() == pytest.approx((lab.world.truth["add_media"],) * 2, abs=0.1)
+    assert lab.world.truth["add_media"] > 8.0
+    assert not [options for _, options in lab.world.asked if "duration" in options]
+    lab.sample()
+    lab.dose(0.0)  # it was told, and held one dose
+    lab.sample()
+    assert lab.dose(0.5) == 0.5
+
+
+def test_an_event_that_a_bridge_brings_twice_is_booked_once_and_a_late_correction_whole(lab):
+    box = lab.world.box
+    take = box.take
+    box.take = lambda *message: [take(*message), take(*message)]
+    for ml in (0.5, 0.2, 14.0, -3.0):
+        lab.world.event("add_media", ml, "UI")
+    lab.wait(1.0)
+    assert lab.given() == pytest.approx((11.7, 11.7))
+
+
+def test_excesses_that_are_little_each_are_booked_once_they_are_much(lab):
+    planned, lab.world.late_s = 0.0, 0.1
+    for _ in range(10):
+        planned += lab.dose(0.5)
+        lab.wait(10.0)
+        lab.sample()
+    truth = lab.world.truth["add_media"]
+    assert truth > planned + 0.5
+    assert float(lab.ledger(planned).fed_ml[0]) == pytest.approx(truth, abs=LATE_ML + 0.02)
+
+
 def test_a_foreign_automation_forbids_the_dose(lab):
     lab.world.say("dosing_automation/$state", "ready", experiment="another")
     lab.wait(1.0)

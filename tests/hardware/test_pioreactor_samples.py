@@ -331,7 +331,7 @@ def test_what_a_unit_says_of_its_heat_and_its_pumps_is_read_by_its_own_names():
     assert box.on() == [9]
 
 
-@pytest.mark.parametrize(("ml", "counts"), [(10.0, True), (-10.0, True), (10.1, False), (-10.1, False)])
+@pytest.mark.parametrize(("ml", "counts"), [(10.0, True), (-10.0, True), (100.1, False), (-100.1, False)])
 def test_an_event_tells_no_more_than_a_pump_can_give(ml, counts):
     box = mailbox()
     body = {"volume_change": ml, "event": "remove_waste", "source_of_event": "UI", "timestamp": "t"}
