@@ -53,7 +53,7 @@ class PioreactorFamily(Family):
         earlier, began = opening.earlier(), opening.began
         with ExitStack() as stack:
             with not_looked_at():
-                run = format(int(began), "x")
+                run = next((str(row["run"]) for row in earlier if row.get("run")), format(int(began), "x"))
                 units = self.units(opening.backend, opening.bench, opening.folder, opening.journal.append, run)
                 reactors = stack.enter_context(units)
                 if not earlier:

@@ -30,10 +30,11 @@ TWICE_S = 0.2  # two messages that are not of the same instant
 
 
 class Reading(NamedTuple):
-    """One OD reading: when it arrived by our clock, the value."""
+    """One OD reading: when it arrived by our clock, the value, whether it is of a calibration and so no voltage."""
 
     at: float
     value: float
+    calibrated: bool = False
 
 
 class Event(NamedTuple):
@@ -204,9 +205,9 @@ class Mailbox:
         if retained or stamp == self._stamp:
             self.refused += 1
             return
-        value = _number(said["ods"][self._channel]["od"])
-        self._stamp = stamp
-        self.readings.append(Reading(now, value))
+        mine = said["ods"][self._channel]
+        value, self._stamp = _number(mine["od"]), stamp
+        self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:
         """What jobs said of themselves, before it is said again; a pump's job ends with the broker."""

@@ -29,19 +29,18 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
     except ReactorError as error:
         detail, _, remedy = str(error).partition("; ")
         checks = [Check("broker", False, detail, remedy)]
-    leader = Web(reactors.config.leader_address)
     for station in reactors.stations:
         try:
-            checks += list(_unit(station, reactors, leader))
+            checks += list(_unit(station, reactors))
         except ReactorError as error:
             checks.append(Check(f"{station.name} link", False, str(error), "check power, network and backend.units"))
-    leader.close()
     return checks
 
 
-def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterator[Check]:
+def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
     unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
+    leader = unit.leader
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))
     yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")
@@ -60,6 +59,10 @@ def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterat
             detail, _, remedy = str(error).partition("; ")
             yield Check(f"{name} {pump}", False, detail, remedy)
     settings = _settings(name, web, leader)
+    norm = str(settings.get("od_reading.config", {}).get("ref_normalization", "classic"))
+    scaled = norm == "classic" or config.od_scale != 1.0 or any(device.startswith("od") for device in calibrations)
+    remedy = "calibrate OD, give backend.od_scale, or set it to classic in the vendor's page"
+    yield Check(f"{name} scale", scaled, f"ref_normalization = {norm}", remedy)
     eyes = {k: v for k, v in settings.get("od_config.photodiode_channel", {}).items() if v not in ("", "REF")}
     sees = ", ".join(f"{k} at {v} degrees" for k, v in eyes.items()) or "none"
     remedy = f"allowed backend.channel or backend.units.{name}.channel one of these, or set it in the vendor's page"
@@ -88,14 +91,11 @@ def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterat
 
 def _experiment(name: str, wanted: str, leader: Web) -> Iterator[Check]:
     """Whether the unit is in the experiment that its jobs are to run in: the vendor shows nothing of another."""
-    remedy = "give backend.experiment=NAME of the one it is in, or assign it in the vendor's page"
+    remedy = "give backend.experiment=NAME of the one it is in, or assign it, active, in the vendor's page"
     try:
-        found = str(leader.get(f"/workers/{name}/experiment", below="/api").get("experiment"))
-        yield Check(f"{name} experiment", found == wanted, f"{found}, backend.experiment = {wanted}", remedy)
+        why = leader.astray(name)
+        yield Check(f"{name} experiment", not why, f"{why or 'active'}, backend.experiment = {wanted}", remedy)
     except NotHeard as error:
-        if "status 404" in str(error):
-            yield Check(f"{name} experiment", False, "the leader knows no experiment that it is in", remedy)
-            return
         yield Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
 
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 from hardware.clock import Clock
-from hardware.errors import ReactorError
+from hardware.errors import LinkError, ReactorError
+from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import PUMPS, Event, Pin
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
@@ -197,15 +198,31 @@ class Pumps:
         """What the events of a run reported so far, mL."""
         return self.reported.get((request.job, request.dose), 0.0)
 
-    def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
-        """Ask for one pump job and follow it; what it gave. It is never asked for again."""
-        request = Request(job, round(ml, 4), dose, self.clock.now(), self.pin(job).ran_s)
-        self.counted[job, dose] = math.inf
-        future = self.web.ask(self.web.run, job, {"ml": request.ml, "source-of-event": dose})
+    def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
+        """Wait for a request while the other units go on. Raises: as the request."""
+        future = self.web.ask(what, *given)
         while not future.done():
             yield STEP_S
+        return future.result()
+
+    def calibrate(self) -> Steps[None]:
+        """Read what each pump gives by its calibration now. Raises: ReactorError."""
+        said = yield from self.answer(self.web.get, "/active_calibrations")
+        self.flow_ml_s = {MEDIA: flow(said, "media_pump"), WASTE: flow(said, "waste_pump")}
+
+    def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
+        """Ask for one pump job and follow it; what it gave. It is never asked for again."""
         try:
-            request = replace(request, task=future.result())
+            yield from self.calibrate()
+            if not self.mqtt.connected:
+                raise LinkError("no MQTT broker, so nobody would follow it")
+        except ReactorError as error:
+            return Moved(end=f"not given: {error}")
+        request = Request(job, round(ml, 4), dose, self.clock.now(), self.pin(job).ran_s)
+        self.counted[job, dose] = math.inf
+        try:
+            task = yield from self.answer(self.web.run, job, {"ml": request.ml, "source-of-event": dose})
+            request = replace(request, task=task)
             self.book.log("task", id=dose, job=job, task=request.task)
         except NotHeard as error:
             self.counted[job, dose] = 0.0

@@ -44,12 +44,13 @@ class PioreactorReactors(Stations[Station, History]):
         self.config, self._real = config, real
         run = run or format(int(time.time()), "x")
         boxes = {unit: Mailbox(unit, config, real) for unit in config.reactors}
+        self.leader = Web(config.leader_address, config.experiment)
         self.mqtt = Cluster(config, boxes, f"turbidostat-{run}-{config.reactors[0]}", real)
         self.stations = tuple(
             Station(
                 Unit(
                     name, config.of(name), bench, bench.volume_of(name), Web(config.address(name), config.experiment),
-                    self.mqtt, box, clock, Logbook(name, self.note_down, self.write, self.elapsed), run,
+                    self.leader, self.mqtt, box, clock, Logbook(name, self.note_down, self.write, self.elapsed), run,
                 )
             )
             for name, box in boxes.items()
@@ -115,5 +116,6 @@ class PioreactorReactors(Stations[Station, History]):
     def close(self) -> None:
         """Leave the broker and the units. Idempotent."""
         self.mqtt.close()
+        self.leader.close()
         for station in self.stations:
             station.unit.web.close()

@@ -8,6 +8,7 @@ import numpy as np
 
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Reading
+from hardware.safety.config import RAW_MIN
 
 __all__ = ["Sample", "Sampling"]
 
@@ -57,10 +58,11 @@ class Sampling:
         values = np.array([r.value for r in used])
         middle = float(np.median(values))
         spread = 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(len(used))
+        dark = RAW_MIN if used[-1].calibrated else 0.0  # of clear medium it may be 0
         scale, zero = self._config.od_scale, self._config.od_zero
         self.newest = Sample(
             float(np.mean([r.at for r in used])), (middle - zero) * scale, spread * scale,
-            min(max(middle * COUNTS, 0.0), 60_000.0), len(used),
+            min(max(middle * COUNTS, dark), 60_000.0), len(used),
         )  # fmt: skip
         self.arrived_s, self.count = now, self.count + 1
         late = now - self._due > 0.5 * self._period_s

@@ -5,15 +5,14 @@ pauses, real seconds, in which the other units go on.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, TypeVar
 
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, Plan
-from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, flow, regulates, request, target_of
+from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import AUTOMATIONS
-from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
+from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, boot_of
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
@@ -22,8 +21,6 @@ from hardware.reactor import Fault
 from hardware.stations import Newest
 
 __all__ = ["UNHEARD", "Station"]
-
-T = TypeVar("T")
 
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
 RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
@@ -50,10 +47,11 @@ class Station:
         self._clock, self._real = unit.clock, unit.real
         self._pumps = Pumps(unit)
         self.doses = Doses(self._pumps)
+        self._answer = self._pumps.answer
         self.sampling = Sampling(unit.config, unit.bench.period_s, self._clock.now())
         self.regulated_od = self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = False
-        self._calls = Calls(self._web, self._real)
+        self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
         self._course: Iterator[float] | None = None
         self._gone, self._been, self._ended, self._missing = set[str](), set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
@@ -69,9 +67,7 @@ class Station:
         """
         self.regulated_od = history.handed_over
         self._pumps.facts = facts(str((yield from self._answer(self._web.get, "/versions/app")).get("version")))
-        calibrations = yield from self._answer(self._web.get, "/active_calibrations")
-        for job, pump in ((MEDIA, "media_pump"), (WASTE, "waste_pump")):
-            self._pumps.flow_ml_s[job] = flow(calibrations, pump)
+        yield from self._pumps.calibrate()
         rows = yield from self._answer(self._web.running)
         self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
         if AUTOMATION in self._listed and not self.handed_over:
@@ -89,8 +85,9 @@ class Station:
             if not self._there(job):
                 yield from self._start(job)
         self.book.log(
-            "device", device_id=self.name, url=self._web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot
-        )
+            "device", device_id=self.name, url=self._web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot,
+            run=self.unit.run,
+        )  # fmt: skip
         self.book.log("temperature", temperature=self._target)
         yield from () if history.open else self.hear_pins()
         self.up = True
@@ -119,13 +116,6 @@ class Station:
             yield from self.bring_up(history)
         except ReactorError as error:
             self.lie_down(error, history)
-
-    def _answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
-        """Wait for a request while the other units go on. Raises: as the request."""
-        future = self._web.ask(what, *given)
-        while not future.done():
-            yield STEP_S
-        return future.result()
 
     def _start(self, job: str) -> Iterator[float]:
         """Ask for one of the vendor's jobs. Raises: ReactorError."""
@@ -156,6 +146,8 @@ class Station:
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
                 self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
+        if said := self._leads.ask("assigned", GRACE_S / 2.0, self.unit.leader.astray, self.name):
+            self._astray = said[0]
         unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
         if unsent and (said := self._calls.ask("level", RESEND_S, self._web.set_level, self.level_ml)):
             self.book.tell(f"its own ledger: {said[0] or f'{self.level_ml:g} mL'}")
@@ -211,6 +203,8 @@ class Station:
             who, _, done = other.partition("; ")
             return Fault("mode", who, done)
         theirs = [job for job in AUTOMATIONS if self._box.live(job)]
+        if self._astray:
+            return Fault("mode", self._astray, f"assign it to {self._config.experiment}, active, in the vendor's page")
         if theirs and not (self.handed_over and theirs == [AUTOMATION]):
             return Fault("mode", f"{theirs[0]} of the vendor's runs", "stop it in the vendor's page; it is counted")
         if self.doses.foreign and not self.handed_over:

@@ -16,9 +16,9 @@ __all__ = ["Unit"]
 class Unit:
     """One unit's surroundings.
 
-    name: as in the vendor's page. config: of this unit. bench: period, bottle. volume_ml: of its culture. web, mqtt,
-    box: the ways to it. clock: of the run, whose `real` is that of messages and jobs. book: what it reports. run: of
-    this run, part of every dose's id.
+    name: as in the vendor's page. config: of this unit. bench: period, bottle. volume_ml: of its culture. web, leader,
+    mqtt, box: the ways to it and to its leader. clock: of the run, whose `real` is that of messages and jobs. book:
+    what it reports. run: of this run, part of every dose's id.
     """
 
     name: str
@@ -26,6 +26,7 @@ class Unit:
     bench: Bench
     volume_ml: float
     web: Web
+    leader: Web
     mqtt: Cluster
     box: Mailbox
     clock: DeviceClock

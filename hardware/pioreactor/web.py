@@ -69,6 +69,18 @@ class Web:
             return str(error)
         return ""
 
+    def astray(self, unit: str) -> str:
+        """Why a unit is none of our experiment by this leader's word, "" if it is. Raises: LinkError, ProtocolError."""
+        try:
+            said = self.get(f"/workers/{unit}/experiment", below="/api")
+        except NotHeard as error:
+            if "status 404" not in str(error):
+                raise
+            return "the leader knows no experiment that it is in"
+        if (found := str(said.get("experiment"))) != self._experiment:
+            return f"it is in the experiment {found}"
+        return "" if said.get("is_active", 1) else "it is inactive"
+
     def result(self, task: str) -> bool | None:
         """Whether the process that a task began may be there; False: it is over and failed; None: the task waits.
 

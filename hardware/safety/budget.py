@@ -20,7 +20,8 @@ class FeedBudget:
     Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
     """
 
-    remembers = ("volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable")
+    remembers = ("volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_paid_ml", "_unusable")
+    added = ("_paid_ml",)
 
     def __init__(self, config: SafetyConfig, bench: Bench, tube_ml: Array, full_ml: Array) -> None:
         self._config, self._bench, n = config, bench, len(tube_ml)
@@ -31,6 +32,7 @@ class FeedBudget:
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
         self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
         self._owed_ml = np.zeros(n)  # allowed but not dosed since the last dose
+        self._paid_ml = np.zeros(n)  # of it, what that dose settled
         self._unusable = np.zeros(n)  # proposals in a row that were no rate
 
     def check(self, rate: Array, fresh: Mask, now: float) -> tuple[Array, list[Finding]]:
@@ -95,9 +97,11 @@ class FeedBudget:
         within = self._minute - now // 60.0 < 60.0
         self._hour[:, int(now // 60.0) % 60] += np.where(within, feed, 0.0)
         self.fed_ml = self.fed_ml + feed
-        dosed = feed > 0.0
+        dosed, newest = feed > 0.0, self._dose_ml[:, -1]
         for mine, new in ((self._dose_s, np.full(len(feed), now)), (self._dose_ml, feed)):
             mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
-        self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
+        undone = (feed < 0.0) & (-feed >= 0.9 * newest)  # booked when it began, and not given
+        self._paid_ml, owed = np.where(dosed, self._owed_ml, self._paid_ml), self._owed_ml + undone * self._paid_ml
+        self._owed_ml = np.where(dosed, 0.0, owed)
         level = np.maximum(self.volume_ml + feed - waste, self._tube_ml)
         self.volume_ml = np.where(waste != 0.0, level, self.volume_ml + feed)

@@ -23,7 +23,7 @@ from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import History
-from hardware.pioreactor.web import NotHeard
+from hardware.pioreactor.web import NotHeard, Web
 from hardware.reactor import Command, Measurement
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import SafetyConfig
@@ -51,6 +51,7 @@ class World(VirtualClock):
     def __init__(self, version: str = "26.11.1") -> None:
         super().__init__(1000.0)
         self.version, self.boot = version, "boot1"
+        self.assigned: dict[str, Any] = {"experiment": EXPERIMENT, "is_active": 1}
         self.number, self.duty = tuple(map(int, version.split("."))), "30"
         self.box: Mailbox | None = None
         self.mqtt: Any = None
@@ -423,6 +424,10 @@ class FakeWeb:
             if "dosing_automation" not in self.world.rows:
                 raise NotHeard("status 404")
             return {"settings": self.settings}
+        if path == f"/workers/{UNIT}/experiment":
+            if not self.world.assigned:
+                raise NotHeard("status 404")
+            return self.world.assigned
         return {
             "/health": {"pioreactor_unit": UNIT, "utc_time": "2026-11-21T00:00:00Z"},
             "/versions/app": {"version": self.world.version},
@@ -450,6 +455,9 @@ class FakeWeb:
         if dose and w.heard in ("lost answer", "nobody"):
             raise LinkError("timed out")
         return task
+
+    astray = Web.astray
+    _experiment = EXPERIMENT
 
     def set_level(self, level_ml: float) -> str:
         self._up()

@@ -163,6 +163,16 @@ def test_what_a_job_of_several_pumps_gives_is_told_booked_by_its_pins_and_left_t
     assert lab.dose(0.5) == 0.5
 
 
+def test_a_pump_that_was_calibrated_anew_is_booked_by_that(lab, monkeypatch):
+    """It gives half as much, and its unit knows."""
+    monkeypatch.setitem(FLOW, "add_media", 0.35)
+    lab.web.active["media_pump"] = {"curve_data_": {"type": "poly", "coefficients": [0.35, 0.0]}}
+    lab.dose(0.7)
+    lab.wait(10.0)
+    assert lab.world.truth["add_media"] == pytest.approx(0.7)
+    assert lab.given() == pytest.approx((0.7, 0.7), abs=0.02)
+
+
 def test_an_event_that_a_bridge_brings_twice_is_booked_once_and_a_late_correction_whole(lab):
     box = lab.world.box
     take = box.take

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from envs.bench import Bench
+from envs.plant.plant import PlantConfig
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError
+from hardware.family import Opening
 from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
+from hardware.pioreactor.family import FAMILY
 from hardware.pioreactor.jobs import flow, regulates, request
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.preflight import _unit
@@ -21,6 +24,7 @@ from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
 from hardware.pioreactor.station import UNHEARD
 from hardware.pioreactor.versions import TESTED, facts
+from hardware.pioreactor.web import Web
 from hardware.rig import family as rig
 from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
 
@@ -109,6 +113,38 @@ def test_what_ends_by_itself_is_told_and_started_again_once_and_held_after_that(
         if held:
             lab.world.ready(job, {"target-temperature": 30.0})
             lab.until(lambda: lab.fault is None, 10.0)
+
+
+@pytest.mark.parametrize(
+    "said", [{"experiment": "other", "is_active": 1}, {"experiment": "turbidostat", "is_active": 0}, {}]
+)
+def test_a_unit_that_was_reassigned_made_inactive_or_removed_is_told_and_not_dosed(lab, said):
+    ours, lab.world.assigned = lab.world.assigned, said
+    lab.until(lambda: lab.fault is not None, 60.0)
+    assert lab.fault.kind == "mode"
+    lab.sample()
+    assert lab.dose(0.5) == 0.0
+    lab.world.assigned = ours
+    lab.until(lambda: lab.fault is None, 60.0)
+
+
+def test_a_run_keeps_its_id_when_it_is_resumed(lab, monkeypatch, tmp_path):
+    """By which its doses, and its lock at the broker, are its own."""
+    runs: list[str] = []
+
+    class Stopped(Exception):
+        pass
+
+    def units(_backend, _bench, _folder, _log, run):
+        runs.append(run)
+        raise Stopped
+
+    monkeypatch.setattr(FAMILY, "units", units)
+    journal = SimpleNamespace(rows=lab.rows, append=None)
+    opening = Opening(lab.reactors.config, lab.bench, PlantConfig(), journal, tmp_path, resumed=True)
+    with pytest.raises(Stopped), FAMILY.open(opening):
+        pass
+    assert runs == [lab.station.unit.run]
 
 
 def test_a_target_told_while_the_thermostat_starts_is_told_again(lab):
@@ -204,6 +240,9 @@ class Said:
             "/config/merged": self.settings,
         }[path]
 
+    astray = Web.astray
+    _experiment = "turbidostat"
+
     def running(self) -> list[dict[str, Any]]:
         return []
 
@@ -229,7 +268,7 @@ def test_photodiode_and_tube_are_judged_by_channel_and_volume_of_their_own_unit(
     monkeypatch.setattr(pioreactors, "Cluster", lambda *_given: SimpleNamespace(holder=lambda name: ""))
     config = PioreactorConfig(reactors=("pio01", "pio02"), units={"pio02": UnitConfig(channel=channel)}, channel="2")
     units = PioreactorReactors(config, VirtualClock(), bench=Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0}))
-    checks = {check.name: check for check in _unit(units.stations[1], units, web)}
+    checks = {check.name: check for check in _unit(units.stations[1], units)}
     light, volume = checks["pio02 photodiode"], checks["pio02 volume"]
     assert (light.ok, volume.ok, checks["pio02 wiring"].ok, checks["pio02 pins"].ok) == (*ok, True, False)
     assert (light.detail, volume.detail) == (
@@ -406,19 +445,20 @@ class Wrong(Said):
 def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     config = PioreactorConfig(reactors=("pio01", "pio02"), max_dose_ml=1.2)
     web: Any = Wrong({"1": "90", "2": "REF", "3": "135"}, "20")
-    unit = SimpleNamespace(web=web, config=config.of("pio02"), volume_ml=14.0)
+    unit = SimpleNamespace(web=web, leader=web, config=config.of("pio02"), volume_ml=14.0)
     mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
     web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}
+    web.settings["od_reading.config"] = {"ref_normalization": "unity"}
     doses, nothing = SimpleNamespace(pumps=SimpleNamespace(heard=True)), lambda: iter(())
     station = SimpleNamespace(name="pio02", unit=unit, doses=doses, hear_pins=nothing)
-    found = list(_unit(station, SimpleNamespace(config=config, mqtt=mqtt), web))  # type: ignore[arg-type]
+    found = list(_unit(station, SimpleNamespace(config=config, mqtt=mqtt)))  # type: ignore[arg-type]
     checks = {check.name.removeprefix("pio02 "): check for check in found}
     assert {name for name, check in checks.items() if not check.ok and check.required} == {
-        "identity", "experiment", "photodiode", "wiring", "client", "dosing",
+        "identity", "experiment", "photodiode", "scale", "wiring", "client", "dosing",
     }  # fmt: skip
     assert {name for name, check in checks.items() if not check.ok and not check.required} == {"version", "clock"}
     assert checks["identity"].detail == "the unit at http://pio02.local is pio09"
-    assert checks["experiment"].detail == "older, backend.experiment = turbidostat"
+    assert checks["experiment"].detail == "it is in the experiment older, backend.experiment = turbidostat"
     assert checks["photodiode"].detail == "2 of 1 at 90 degrees, 3 at 135 degrees"
     assert checks["dosing"].detail == "add_alt_media, circulate_media"
     assert "pio jobs remove --job-name add_alt_media" in checks["dosing"].remedy

@@ -17,6 +17,7 @@ from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitC
 from hardware.pioreactor.family import PioreactorFamily
 from hardware.pioreactor.mailbox import LIVE, LOCKS, WORDS, Cluster, Mailbox, Reading, State
 from hardware.pioreactor.sampling import Sampling
+from hardware.safety.config import RAW_MIN
 from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World
 
 
@@ -292,11 +293,13 @@ def test_two_units_have_their_own_values(monkeypatch):
         assert PioreactorConfig(broker="lead.local", leader=leader).leader_address == address
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
 @pytest.mark.parametrize(("reading", "raw"), [(0.6, 6000.0), (-0.2, 0.0), (6.1, 60000.0), (0.00005, 0.5)])
-def test_the_interlock_s_counts_are_those_of_the_photodiode_not_of_the_od(reading, raw):
+def test_the_interlock_s_counts_are_those_of_the_photodiode_not_of_the_od(reading, raw, calibrated):
+    """Of a reading of a calibration they are unknown, and never those of a sensor that failed."""
     sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
-    sampling.take([Reading(1.0, reading), Reading(3.0, reading)])
-    assert sampling.look(4.0, 0.0).raw == pytest.approx(raw)
+    sampling.take([Reading(at, reading, calibrated) for at in (1.0, 3.0)])
+    assert sampling.look(4.0, 0.0).raw == pytest.approx(max(raw, RAW_MIN) if calibrated else raw)
 
 
 def test_readings_of_the_window_count_and_one_alone_is_no_sample():

@@ -708,3 +708,16 @@ def test_what_was_fed_at_least_is_booked_beside_what_was_fed_at_most() -> None:
     assert state["_since_ml"] == pytest.approx([1.3, 0.8, 0.7])
     assert state["_since_low_ml"] == pytest.approx([0.4, 0.8, 0.3])
     assert state["fed_ml"] == pytest.approx([1.3, 0.8, 0.7])
+
+
+def test_doses_that_are_booked_as_they_begin_and_taken_back_are_undosed_until_one_stays():
+    bench, one, none = Bench(), np.ones(1), []
+    budget = FeedBudget(SafetyConfig(), bench, 20.0 * one, 36.0 * one)
+    most_ml = bench.max_rate * bench.period_s
+    for k in range(8):
+        none.append("undosed" in told(budget.check(bench.max_rate * one, one > 0.0, 60.0 * k)[1], 1)[0])
+        budget.grant(bench.max_rate * one)
+        budget.book(most_ml * one, 2.0 * most_ml * one, 60.0 * k)
+        if k != 5:
+            budget.book(-most_ml * one, -most_ml * one, 60.0 * k + 2.0)
+    assert none == [False, False, False, True, True, True, False, False]
