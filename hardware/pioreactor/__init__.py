@@ -1,3 +1,1 @@
-"""The driver of Pioreactors: from the vendor's HTTP and MQTT to samples, doses and faults of one to many units.
-
-Entered through `reactors` and `preflight`. Knows no policy and no simulation."""
+"""The driver of Pioreactors: from the vendor's HTTP and MQTT to samples, doses and faults of one to many units."""

@@ -41,10 +41,7 @@ class UnitConfig:
 
 @dataclass(frozen=True)
 class PioreactorConfig:
-    """How to reach the units of a cluster, and what differs from other families.
-
-    Raises: ValueError naming key, value and allowed range.
-    """
+    """How to reach the units of a cluster, and what differs from other families. Raises: ValueError."""
 
     kind: str = setting("pioreactor", "which backend")
     reactors: tuple[str, ...] = setting(("pio01",), "names of the units, as in the vendor's page", some=True)
@@ -122,10 +119,7 @@ class PioreactorConfig:
         return (self.leader or f"http://{self.broker}").rstrip("/")
 
     def password(self) -> str:
-        """Of the broker, which stands in no config, file of a run or line of the screen.
-
-        Raises: LinkError naming the file and the remedy.
-        """
+        """Of the broker; it stands in no config, file of a run or line of the screen. Raises: LinkError."""
         remedy = "one line with the broker's password, mode 600"
         if not self.password_file:
             return os.environ.get(PASSWORD, SHIPPED)

@@ -8,6 +8,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
 from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, WASTE, Moved, Pumps, Request, Steps
@@ -32,8 +34,8 @@ class Plan:
 class Doses:
     """The doses of one unit, one at a time, at most one per sample.
 
-    Attributes: pumps; ended_s, real time at which the last dose was over; foreign, what was dosed without our command;
-      extra, what was given beyond what was booked when doses began, until somebody books and clears it.
+    Attributes: ended_s, real time at which the last was over; foreign, what was dosed without our command; extra, what
+      was given beyond what was booked when doses began, until somebody books and clears it.
     """
 
     def __init__(self, pumps: Pumps) -> None:
@@ -47,7 +49,7 @@ class Doses:
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
         self._ran_s, self._strange_ml = {MEDIA: 0.0, WASTE: 0.0}, {MEDIA: 0.0, WASTE: 0.0}
-        self._rest_ml = 0.0, 0.0, 0.0
+        self._rest_ml = np.zeros(3)  # fed at most, at least, and risen, beyond what was booked
 
     @property
     def running(self) -> bool:
@@ -70,10 +72,7 @@ class Doses:
         return Plan(feed, self._config.waste_factor * feed)
 
     def begin(self, rate: float, sample: tuple[float, int] | None, refusal: str) -> Plan:
-        """Begin the dose for `sample`, if nothing stands against it; a note says what does.
-
-        Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
-        """
+        """Begin the dose for `sample`, or note what stands against it. Raises: as `plan`; what the log raises."""
         plan = self.plan(rate)
         if reason := refusal or self._obstacle(sample):
             if plan.feed_ml > 0.0:
@@ -135,10 +134,7 @@ class Doses:
         yield from self._conclude(plan, dose, on_s, media, waste)
 
     def _look_for(self, history: History) -> Iterator[float]:
-        """The dose an earlier life left open: what became of it while nobody watched, and what still may.
-
-        Waste that still runs takes only what lies above its tube.
-        """
+        """The dose an earlier life left open: what became of it while nobody watched, and what still may."""
         pumps, dose, asked_ml = self.pumps, history.id, history.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
@@ -153,10 +149,7 @@ class Doses:
         yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
-        """A dose's end on record, then the vial back at its tube, then what was booked otherwise put right.
-
-        Whoever booked the plan when the dose began is told what more was fed, and what the level rose.
-        """
+        """A dose's end on record, then the vial back at its tube, then what was booked when it began put right."""
         self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
         for moved, pump in ((media, "media"), (waste, "waste")):
             if moved.end:
@@ -167,14 +160,12 @@ class Doses:
         self._book.log("dose_end", **row, waste_high_ml=high_ml, id=dose, end=end)
         if media.high > plan.feed_ml + LATE_ML:
             taken += yield from self._drain(media, dose)
-        rise, now_ml = (
-            max(min(media.high, self._room_ml) - taken, 0.0),
-            (media.high - plan.feed_ml, media.low - plan.feed_ml),
-        )
-        more, less, rise = self._rest_ml = tuple(map(sum, zip(self._rest_ml, (*now_ml, rise), strict=True)))
-        if max(abs(more), abs(less), rise) > LATE_ML:  # little is booked once it is much
+        rise = max(min(media.high, self._room_ml) - taken, 0.0)
+        self._rest_ml += media.high - plan.feed_ml, media.low - plan.feed_ml, rise
+        if np.abs(self._rest_ml).max() > LATE_ML:  # little is booked once it is much
+            more, less, rise = self._rest_ml.tolist()
             self.extra.append(Given(self._book.elapsed(), more, less, more - rise))
-            self._rest_ml = 0.0, 0.0, 0.0
+            self._rest_ml = np.zeros(3)
 
     def _drain(self, media: Moved, dose: str) -> Steps[float]:
         """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out, mL."""
@@ -206,8 +197,7 @@ class Doses:
                 ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
                 self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
                 if ran_ml > LATE_ML:
-                    self.foreign = f"{job} of {ran_ml:.2f} mL by its pin, without our command"
-                    self._give(job, ran_ml, ran_ml, self.foreign)
+                    self._theirs(job, ran_ml, "by its pin")
 
     def _settle_strange(self) -> None:
         """Book what was dosed without a command of this run, beyond what was counted already."""
@@ -223,9 +213,11 @@ class Doses:
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
                 continue
-            who = "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}"
-            self.foreign = f"{job} of {over:.2f} mL without our command ({who})"
-            self._give(job, over, over, self.foreign)
+            self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
+
+    def _theirs(self, job: str, ml: float, who: str) -> None:
+        self.foreign = f"{job} of {ml:.2f} mL without our command ({who})"
+        self._give(job, ml, ml, self.foreign)
 
     def _give(self, job: str, low_ml: float, high_ml: float, why: str) -> None:
         """What a pump moved beside our doses, as what it is: when it was noticed, how much, by whom."""

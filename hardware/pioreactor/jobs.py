@@ -23,10 +23,7 @@ def target_of(config: PioreactorConfig, facts: Facts, setpoint: float) -> dict[s
 def request(
     job: str, config: PioreactorConfig, facts: Facts, temperature: float, setpoint: float
 ) -> tuple[dict[str, Any], list[list[str]]]:
-    """Options and overrides of its configuration that a job is asked for with.
-
-    Args: temperature: target of the thermostat, degC. setpoint: of the vendor's turbidostat, OD, nan without one.
-    """
+    """Options and overrides of its configuration that a job is asked for with: of thermostat and turbidostat, too."""
     if job == OD:
         rate = str(round(1.0 / config.reading_s, 4))
         return {}, [[f"{OD}.config", "samples_per_second", rate], [f"{OD}.config", "smoothing_penalizer", "0"]]

@@ -68,11 +68,9 @@ class Pin:
         self.inits = deque[float](maxlen=8)
 
     def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
-        """A message that has all pins of the unit.
+        """A message that has all pins of the unit, of -inf if it was retained and the pin is on.
 
-        Other jobs read them and say so an instant later: a pin that is on without a job is on if it is said twice.
-        Args: at: when it came, -inf if it was retained and on. word: state of the pin's job. echoes: whether others say
-          pins.
+        Where others say pins, too (echoes), they do so late: on without a job (its word) is what is said twice.
         """
         if not on:
             self.ends(at)
@@ -100,13 +98,11 @@ class Pin:
 class Mailbox:
     """What one unit said; filled by `take`, which may be called from another thread. Times are real seconds.
 
-    A retained message of another experiment is of no time that is known, and left out. A pump's job that ended has
-    switched its pin off.
+    A retained message of another experiment is of no time that is known, and left out.
 
-    Attributes: readings and events, newest last, and ignored, kinds of messages that were left out, for the driver to
-      take out; pins; states, of each job by experiment; temperature, and target of the thermostat, degC; stir_duty, of
-      the stirring job, %; heard_s, when the unit last said anything; dc_s, when it last told its pins; channels, in the
-      newest reading; refused, how many messages were left out.
+    Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; pins;
+      states, of each job by experiment; temperature, target, of the thermostat, degC; stir_duty, %; heard_s, when the
+      unit last said anything; dc_s, when it last told its pins; refused, how many messages were left out.
     """
 
     def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
@@ -122,7 +118,6 @@ class Mailbox:
         self.states: dict[tuple[str, str], State] = {}
         self.temperature = self.target = self.stir_duty = math.nan
         self.heard_s = self.dc_s = -math.inf
-        self.channels: tuple[str, ...] = ()
         self.refused, self._stamp, self._said = 0, "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
@@ -201,7 +196,6 @@ class Mailbox:
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
         """A retained reading is the last one of whatever was before; one with the stamp of another is the same."""
         stamp = str(said["timestamp"])
-        self.channels = tuple(sorted(map(str, said["ods"])))
         if retained or stamp == self._stamp:
             self.refused += 1
             return

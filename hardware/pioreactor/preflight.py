@@ -1,5 +1,6 @@
 """Before a run: one line per check, passed or with the remedy. Of a unit it switches stirring, and nothing else."""
 
+import math
 import time
 from collections.abc import Iterator
 from datetime import datetime
@@ -40,7 +41,6 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
 def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
     unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
-    leader = unit.leader
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))
     yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")
@@ -50,7 +50,7 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     said = datetime.fromisoformat(str(health.get("utc_time")).replace("Z", "+00:00")).timestamp()
     off = f"{(error_s := said - time.time()):+.1f} s against this computer"
     yield Check(f"{name} clock", abs(error_s) < CLOCK_S, off, "only its logs suffer", required=False)
-    yield from _experiment(name, config.experiment, leader)
+    yield _experiment(name, config.experiment, unit.leader)
     calibrations = web.get("/active_calibrations")
     for pump in ("media_pump", "waste_pump"):
         try:
@@ -58,7 +58,7 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
         except ReactorError as error:
             detail, _, remedy = str(error).partition("; ")
             yield Check(f"{name} {pump}", False, detail, remedy)
-    settings = _settings(name, web, leader)
+    settings = _settings(name, web, unit.leader)
     norm = str(settings.get("od_reading.config", {}).get("ref_normalization", "classic"))
     scaled = norm == "classic" or config.od_scale != 1.0 or any(device.startswith("od") for device in calibrations)
     remedy = "calibrate OD, give backend.od_scale, or set it to classic in the vendor's page"
@@ -89,14 +89,14 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     yield Check(f"{name} dead man", True, f"{largest}, and every pump job times itself")
 
 
-def _experiment(name: str, wanted: str, leader: Web) -> Iterator[Check]:
+def _experiment(name: str, wanted: str, leader: Web) -> Check:
     """Whether the unit is in the experiment that its jobs are to run in: the vendor shows nothing of another."""
     remedy = "give backend.experiment=NAME of the one it is in, or assign it, active, in the vendor's page"
     try:
         why = leader.astray(name)
-        yield Check(f"{name} experiment", not why, f"{why or 'active'}, backend.experiment = {wanted}", remedy)
     except NotHeard as error:
-        yield Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
+        return Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
+    return Check(f"{name} experiment", not why, f"{why or 'active'}, backend.experiment = {wanted}", remedy)
 
 
 def _settings(name: str, web: Web, leader: Web) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def _queue(name: str, web: Web) -> Check:
     clock = RealClock()
     barrier = Barrier(web, clock)
     while not (passed := barrier.passed()) and clock.now() < QUEUE_S:
-        clock.sleep(0.1)
+        clock.sleep(STEP_S)
     detail = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
     return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")
 
@@ -122,6 +122,6 @@ def _pins(station: Station) -> Check:
     """Whether the unit tells what its pins do."""
     for _ in station.hear_pins():
         station.unit.real.sleep(STEP_S)
-    heard = station.doses.pumps.heard
+    heard = station.unit.box.dc_s > -math.inf
     told = "told when one is switched" if heard else UNHEARD
     return Check(f"{station.name} pins", heard, told, f"tried with {', '.join(TESTED)}; look whether stirring runs")

@@ -45,8 +45,7 @@ Steps = Generator[float, None, T]
 
 @dataclass(frozen=True)
 class Moved:
-    """What a pump moved, mL: at least low, at most high. end: in words, "" for a dose that went as asked. drained: what
-    the waste pump took out meanwhile."""
+    """What a pump moved, mL, at least and at most; end, in words, "" as asked; drained by the waste pump meanwhile."""
 
     low: float = 0.0
     high: float = 0.0
@@ -56,11 +55,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class Request:
-    """A run of a pump that was asked for, or was found.
-
-    ml: as asked. dose: its id, the source of its events. asked_s, ran_s: when it was asked for, and for how long its
-    pin had run then. task: what the unit answered, "" if that is unknown.
-    """
+    """A run of a pump that was asked for (ml), or found (0): its id, when that was, its pin's time then, the answer."""
 
     job: str
     ml: float
@@ -80,9 +75,8 @@ class Calls:
 
     def due(self, kind: str, every_s: float) -> bool:
         """Whether something of this kind is to be done now."""
-        now = self._clock.now()
-        due = now >= self._next.get(kind, -math.inf)
-        self._next[kind] = now + every_s if due else self._next[kind]
+        if due := self._clock.now() >= self._next.get(kind, -math.inf):
+            self._next[kind] = self._clock.now() + every_s
         return due
 
     def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
@@ -96,11 +90,7 @@ class Calls:
 
 
 class Barrier:
-    """Whether nothing older waits in the task queue any more: a harmless request behind it was taken.
-
-    It is made anew now and then, because a unit that boots forgets what was written down. Args: wait_s: until the
-    first.
-    """
+    """Whether nothing older waits in the task queue: a harmless request behind it, made now and then, was taken."""
 
     def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
         self._calls, self._web, self._task = Calls(web, clock), web, ""
@@ -125,11 +115,11 @@ def boot_of(rows: list[dict[str, Any]]) -> str:
 class Pumps:
     """Media and waste pump of one unit.
 
-    Attributes: flow_ml_s, of each by its active calibration; reported, mL by job and source of the events; counted, mL
-      of them that whoever asked for them books, inf while they are under way; facts, of the unit's version; boot, when
-      the unit was started; proven, jobs whose pumps were ended here, and when; trouble, why no dose may be given, "" if
-      one may; cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for
-      somebody or something else.
+    Attributes: ours, how every id of this run begins; short, that of a run that only ends with its pin off; flow_ml_s,
+      by the active calibrations; reported, mL by job and source of the events; counted, mL of them that whoever asked
+      for them books, inf while they are under way; facts, of the unit's version; boot, when it was started; proven,
+      when pumps were ended here; trouble, why no dose may be given, "" if one may; cut, whether media is to end,
+      halted, whether everything is; waits, whether what is under way waits for somebody or something else.
     """
 
     def __init__(self, unit: Unit) -> None:
@@ -141,16 +131,8 @@ class Pumps:
         self.facts, self.boot = Facts(), ""
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
         self.proven: dict[str, float] = {}
-
-    @property
-    def short(self) -> str:
-        """The id of a run of a pump that only ends with its pin off."""
-        return f"{self.ours}{self.unit.name}/off"
-
-    @property
-    def ours(self) -> str:
-        """How every id of this run begins."""
-        return f"{OURS}{self.unit.run}/"
+        self.ours = f"{OURS}{unit.run}/"
+        self.short = f"{self.ours}{unit.name}/off"
 
     def take(self, event: Event) -> None:
         """A dosing event; a correction is negative, and of what was reported."""
@@ -178,21 +160,13 @@ class Pumps:
     @property
     def locks(self) -> str:
         """What to do about a lock that a killed process left."""
-        pins = ", ".join(map(str, self.config.pump_pins))
-        word = f"{self.facts.purge} pwm_locks PIN --as-int"
-        return (
-            f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word} (pins {pins})"
-        )
+        word = f"{self.facts.purge} pwm_locks PIN --as-int (pins {', '.join(map(str, self.config.pump_pins))})"
+        return f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word}"
 
     def ask_pins(self) -> None:
         """Have stirring say all pins again: by a duty that differs a little, for newer versions tell only changes."""
         if not math.isnan(duty := self.box.stir_duty):
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
-
-    @property
-    def heard(self) -> bool:
-        """Whether the unit has told what its pins do since we listen."""
-        return self.box.dc_s > -math.inf
 
     def said(self, request: Request) -> float:
         """What the events of a run reported so far, mL."""
@@ -240,7 +214,8 @@ class Pumps:
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
         late = self.clock.now() + request.ml / self.flow_ml_s[job] + OVERRUN_S
         while not self._is_over(request):
-            if self._unwanted(job) or self.odd(job) or self.broke(request) or self.clock.now() > late:
+            unwanted = self.halted or (self.cut and job == MEDIA)
+            if unwanted or self.odd(job) or self.broke(request) or self.clock.now() > late:
                 return (yield from self.end(request))
             yield STEP_S
         return self._moved(request)
@@ -249,15 +224,8 @@ class Pumps:
         """Whether the connection to the broker was lost since a run was asked for."""
         return self.mqtt.broke_s >= request.asked_s
 
-    def _unwanted(self, job: str) -> bool:
-        return self.halted or (self.cut and job == MEDIA)
-
     def _begins(self, request: Request) -> Steps[str]:
-        """A request until its pump begins, then ""; or until it is certain that it never will, then why.
-
-        That is where its task is over and failed; where its job came and went; where it, or one that was queued behind
-        it, was taken from the queue and no job came for long; where the unit was started again.
-        """
+        """A request until its pump begins, then ""; or until it is certain that it never will, then why (as below)."""
         job, asked_s, what = request.job, request.asked_s, f"{request.ml:.2f} mL"
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
         never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
@@ -283,20 +251,17 @@ class Pumps:
                 why = f"accepted and not carried out: {self.locks}"
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
-            if self._unwanted(job) and calls.due("stop", 1.0):  # heard only once the job listens
+            if (self.halted or (self.cut and job == MEDIA)) and calls.due("stop", 1.0):  # heard once the job listens
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
-        if late and not why:
-            self.book.tell(f"{job} of {what} ran late")
         if late:
             self.trouble, self.waits = "", False
+            if not why:
+                self.book.tell(f"{job} of {what} ran late")
         return why
 
     def last_word(self, request: Request) -> str:
-        """What the job of a run last said of itself, "" while that is unknown.
-
-        Two processes of one name say it by one topic; over a broken connection nobody knows whose it was.
-        """
+        """What the job of a run last said of itself; "" is unknown: two processes share a topic, or it broke."""
         pin, state = self.pin(request.job), self.box.state(request.job)
         alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
         return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
@@ -350,23 +315,17 @@ class Pumps:
     def _plug(self, job: str) -> str:
         pin = self.box.jobs[job]
         how = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
-        return (
-            f"pin {pin} may run on after {job}, {how}; pull the pump's plug, or on the unit: "
-            f"{self.facts.purge} pwm_locks {pin} --as-int (it is then ended from here)"
-        )
+        word = f"{self.facts.purge} pwm_locks {pin} --as-int (it is then ended from here)"
+        return f"pin {pin} may run on after {job}, {how}; pull the pump's plug, or on the unit: {word}"
 
 
 class Seen(NamedTuple):
-    """What is known of a pump that is to be off.
+    """What is known of a pump that is to be off."""
 
-    boot: its unit was started since. pin: "on" or "off" as told since, "" untold. short: of a run asked for to switch
-    it off, "asked", or "ended" by its own event and what its job said after it; "" before. word: as of `last_word`.
-    """
-
-    boot: bool
-    pin: str
-    short: str
-    word: str
+    boot: bool  # its unit was started since
+    pin: str  # "on" or "off" as told since, "" untold
+    short: str  # of a run to switch it off: "", "asked", or "ended" by its own event and its job's word after it
+    word: str  # as of `last_word`
 
 
 PROOFS: tuple[dict[str, tuple[Any, ...]], ...] = (
@@ -385,19 +344,16 @@ def is_off(seen: Seen) -> bool:
 class ForcedEnd:
     """One pump on its way to being proven off: what is tried, and what proves it.
 
-    The job is asked by MQTT and by HTTP. Stirring is asked to say all pins again. A short run of the same pump sets its
-    pin to 0 as it begins and as it ends, if no lock forbids that; its events are booked as those of anybody. Each is
-    tried again and again, at its own pace; of short runs at most `SHORTS` are carried out, and none is asked for while
-    an earlier one may still wait.
-
-    Args: pumps: of the unit. request: whose pump is ended. Attributes: began, when it did.
+    The job is asked by MQTT and by HTTP, stirring to say all pins again. A short run of the same pump sets its pin to 0
+    if no lock forbids that; its events are booked as anybody's. Each is tried again at its own pace; of short runs at
+    most `SHORTS` are carried out, and none is asked for while an earlier one may still wait.
     """
 
     def __init__(self, pumps: Pumps, request: Request) -> None:
         self._p, self._request, self._job, self._since = pumps, request, request.job, request.asked_s
         self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
         told_s = pumps.pin(request.job).event_s
-        self._from_s = max(request.asked_s, told_s) if math.isfinite(told_s) else request.asked_s
+        self._from_s = max(request.asked_s, told_s if told_s < math.inf else -math.inf)
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
         self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
@@ -458,10 +414,7 @@ class ForcedEnd:
 
     @property
     def _untold(self) -> bool:
-        """Whether the pin of a dose that had to be ended was not said to be on.
-
-        The vendor's job switches the pin before it publishes that: what others publish may be stale.
-        """
+        """Whether the pin of a dose that had to be ended was not said to be on: its job switches first."""
         heard = self._since <= self._p.pin(self._job).on_s < self._short_s
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 

@@ -32,12 +32,7 @@ class PioreactorReactors(Stations[Station, History]):
     """
 
     def __init__(
-        self,
-        config: PioreactorConfig,
-        real: Clock,
-        log: Log = no_log,
-        run: str = "",
-        bench: Bench | None = None,
+        self, config: PioreactorConfig, real: Clock, log: Log = no_log, run: str = "", bench: Bench | None = None
     ) -> None:
         clock, bench = DeviceClock(config.speed, real), bench or Bench()
         super().__init__(clock, bench.stale_s, log)

@@ -12,10 +12,7 @@ __all__ = ["History", "replay"]
 
 @dataclass(frozen=True)
 class History(history.History):
-    """One unit's past.
-
-    boot: when the unit had been started. Of an open dose: id; task, what the unit answered to its request.
-    """
+    """One unit's past; boot, when it had been started; of an open dose id, and task, the answer to its request."""
 
     boot: str = ""
     id: str = ""

@@ -8,11 +8,11 @@ import numpy as np
 
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Reading
-from hardware.safety.config import RAW_MIN
 
 __all__ = ["Sample", "Sampling"]
 
 FEWEST = 2  # readings of a sample
+DARK = 5.0  # counts, below which the interlock calls a light sensor failed
 COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt
 
 
@@ -29,10 +29,7 @@ class Sample:
 
 
 class Sampling:
-    """Readings of one unit.
-
-    Attributes: newest, the last sample; arrived_s, clock time at which it was made; read_s, of the newest reading.
-    """
+    """Readings of one unit; its newest sample, when that was made (arrived_s), and of the newest reading (read_s)."""
 
     def __init__(self, config: PioreactorConfig, period_s: float, now: float) -> None:
         self._config, self._period_s = config, period_s
@@ -47,10 +44,7 @@ class Sampling:
         self.read_s = readings[-1].at if readings else self.read_s
 
     def look(self, now: float, undisturbed_s: float) -> Sample | None:
-        """The sample that is due, None if none is, or the readings for one are not there yet.
-
-        Args: undisturbed_s: clock time from which readings count.
-        """
+        """The sample that is due, None if none is or the readings are not there, which count from undisturbed_s."""
         begin = max(undisturbed_s, now - self._config.window_s)
         used = [r for r in self._readings if r.at >= begin] if now >= self._due else []
         if len(used) < FEWEST:
@@ -58,7 +52,7 @@ class Sampling:
         values = np.array([r.value for r in used])
         middle = float(np.median(values))
         spread = 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(len(used))
-        dark = RAW_MIN if used[-1].calibrated else 0.0  # of clear medium it may be 0
+        dark = DARK if used[-1].calibrated else 0.0  # of clear medium it may be 0
         scale, zero = self._config.od_scale, self._config.od_zero
         self.newest = Sample(
             float(np.mean([r.at for r in used])), (middle - zero) * scale, spread * scale,

@@ -34,9 +34,8 @@ FRESH = 4.0  # periods of readings in which one that is taken has arrived
 class Station:
     """One unit of a cluster.
 
-    Attributes: unit, its surroundings; book, doses, sampling: its parts; regulated_od, OD at which the vendor's
-      turbidostat was started, nan if it was not; level_ml, that the unit's own ledger is to be put to, nan if it is
-      not; up, whether it was brought up; next_look, which is always.
+    Attributes: regulated_od, OD at which the vendor's turbidostat was started, nan if it was not; level_ml, that the
+      unit's own ledger is to be put to, nan if it is not; up, whether it was brought up; next_look, which is always.
     """
 
     next_look = -math.inf
@@ -61,10 +60,7 @@ class Station:
     # -- bringing up -----------------------------------------------------------------------------------------------
 
     def bring_up(self, history: History) -> Iterator[float]:
-        """Version and calibrations read, jobs adopted or started, an open dose of an earlier life looked for.
-
-        Raises: ReactorError for what no waiting can mend.
-        """
+        """Version and calibrations read, jobs adopted or started, an open dose looked for. Raises: ReactorError."""
         self.regulated_od = history.handed_over
         self._pumps.facts = facts(str((yield from self._answer(self._web.get, "/versions/app")).get("version")))
         yield from self._pumps.calibrate()
@@ -84,20 +80,19 @@ class Station:
         for job in self._wanted():
             if not self._there(job):
                 yield from self._start(job)
-        self.book.log(
-            "device", device_id=self.name, url=self._web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot,
-            run=self.unit.run,
-        )  # fmt: skip
+        p, url = self._pumps, self._web.url
+        self.book.log("device", device_id=self.name, url=url, flows=p.flow_ml_s, boot=p.boot, run=self.unit.run)
         self.book.log("temperature", temperature=self._target)
         yield from () if history.open else self.hear_pins()
         self.up = True
 
     def hear_pins(self) -> Iterator[float]:
         """Course: switch a pin, that of stirring, until the unit tells it, for at most a minute."""
-        began, own = self._real.now(), not (self._pumps.heard or self._box.live(STIR) or STIR in self._asked_s)
+        until_s, box = self._real.now() + UNSTARTED_S, self._box
+        own = math.isinf(box.dc_s) and not box.live(STIR) and STIR not in self._asked_s
         with suppress(ReactorError):
             yield from self._start(STIR) if own else ()
-            while not self._pumps.heard and self._real.now() < began + UNSTARTED_S:
+            while math.isinf(box.dc_s) and self._real.now() < until_s:
                 if self._calls.due("pins", RESEND_S):
                     self._pumps.ask_pins()
                 yield STEP_S
@@ -144,8 +139,8 @@ class Station:
         if rows := self._calls.ask("rows", GRACE_S / 2.0, self._web.running):
             self._listed = {str(row["job_name"]) for row in rows[0]}
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
-                self._pumps.boot = boot_of(rows[0])
-                self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
+                self._pumps.boot = boot = boot_of(rows[0])
+                self.book.log("device", device_id=self.name, url=self._web.url, boot=boot)
         if said := self._leads.ask("assigned", GRACE_S / 2.0, self.unit.leader.astray, self.name):
             self._astray = said[0]
         unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
@@ -154,7 +149,7 @@ class Station:
             self.level_ml = math.nan
         if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", RESEND_S):
             self._pumps.ask_pins()
-        if not self._pumps.heard:
+        if math.isinf(self._box.dc_s):
             self._course = self._course or self.hear_pins()
         self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
         self._steer()
@@ -196,7 +191,7 @@ class Station:
     def _wrong(self) -> Fault | None:
         """What is wrong now."""
         if not self._mqtt.connected:
-            return Fault("link", "no MQTT broker", "the leader is off or its network is; doses wait")
+            return Fault("link", "no MQTT broker", "look at the leader: power, network, mosquitto; doses wait")
         if self._pumps.trouble:
             return Fault("pump", self._pumps.trouble, "nothing is dosed until that is known")
         if other := self._mqtt.holder(self.name):
@@ -215,7 +210,7 @@ class Station:
             again = "it ended twice, start it in the vendor's page" if job in self._ended else "asked for again"
             remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
             return Fault("stopped", f"the unit {GONE[job]}", remedy)
-        if not self._pumps.heard:
+        if math.isinf(self._box.dc_s):
             return Fault("pump", UNHEARD, f"tried with {', '.join(TESTED)}; look whether stirring runs")
         if self._trouble:
             return Fault("link", self._trouble, "check the unit's web server")
@@ -228,10 +223,7 @@ class Station:
         return [job for job, it_is in wanted.items() if it_is]
 
     def _there(self, job: str) -> bool:
-        """Whether a job is there: by its own word; readings, by what they bring; else by the unit's list.
-
-        A job that goes on over a restart of the broker may never say so again.
-        """
+        """Whether a job is there: by its own word, which a restarted broker forgets; by its readings; by the list."""
         longest_s = self._clock.of_real(FRESH * self._config.reading_s)
         if job == OD and self.sampling.count:
             silent_s = self._clock.now() - self.sampling.read_s
@@ -242,11 +234,7 @@ class Station:
         return self._box.live(job) if state.word and known else job in self._listed
 
     def _is_gone(self, job: str) -> bool:
-        """Whether a job should run and does not: readings stopped in whatever way; others killed, or never there.
-
-        It is asked for again, and again; until it is there it is gone. One that said itself that it ended, whoever did
-        that, is asked for once.
-        """
+        """Whether a job should run and does not; it is asked for again, once if it said itself that it ended."""
         if self._there(job):
             self._gone.discard(job)
             self._been.add(job)
@@ -293,10 +281,7 @@ class Station:
         self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Send the thermostat its target until it says it: what is sent while it starts is not heard.
-
-        One that goes on over a restart of the broker may hear nothing any more: it is then started anew.
-        """
+        """Send the thermostat its target until it says it; one that hears nothing any more is started anew."""
         if not self._target_sent_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
@@ -313,10 +298,7 @@ class Station:
         return self.end_pumps(PUMPS_S)
 
     def end_pumps(self, real_s: float, final: bool = False) -> Iterator[float]:
-        """Course: every pump off, verified; a dose under way is cut. Args: final: what empties a vial is cut, too.
-
-        Raises: DeviceStateError naming what is not verified off.
-        """
+        """Course: every pump off, verified; a dose is cut, waste only if final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
         pumps.cut, pumps.halted = True, final
         try:
@@ -357,10 +339,7 @@ class Station:
             yield STEP_S
 
     def regulate(self, setpoint: float) -> Iterator[float]:
-        """Course: handed over to the vendor's turbidostat for good, once it says that it regulates at this setpoint.
-
-        Raises: ReactorError if it does not come up.
-        """
+        """Course: handed over to the vendor's turbidostat for good once it says so. Raises: ReactorError."""
         yield from self.end_pumps(self._config.stop_s)
         self.regulated_od, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
         try:

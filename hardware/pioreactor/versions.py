@@ -44,10 +44,7 @@ def number(version: str) -> tuple[int, ...]:
 
 
 def facts(version: str) -> Facts:
-    """Of a version; of one that is newer than the table those of its last row.
-
-    Args: version: as the unit says it, e.g. "26.7.2"; text without a number is older than all.
-    """
+    """Of a version as the unit says it; without a number it is older than all, and a newer one is the last row's."""
     known = Facts()
     for since, changed in CHANGES:
         if number(version) >= number(since):

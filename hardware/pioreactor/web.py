@@ -23,10 +23,7 @@ class NotHeard(LinkError):
 
 
 class Web:
-    """`/unit_api` of one unit. Its requests wait on a thread of their own, one after another.
-
-    Args: url: e.g. http://pio01.local. experiment: that jobs run in.
-    """
+    """`/unit_api` of one unit, for an experiment. Requests wait on a thread of their own, one after another."""
 
     def __init__(self, url: str, experiment: str = "", timeout_s: float = 4.0) -> None:
         self.url, self._timeout_s, self._experiment = url, timeout_s, experiment
@@ -56,10 +53,7 @@ class Web:
         self.send("POST", f"/jobs/stop?job_name={job}", {"job_name": job})
 
     def set_level(self, level_ml: float) -> str:
-        """Put the unit's own ledger of the vial to a volume; why it refuses that, "" if it does not. Raises: as `send`.
-
-        Newer versions refuse doses by it.
-        """
+        """Put the unit's own ledger of the vial to a volume; why it refuses that, "" if not. Raises: as `send`."""
         path = f"/bioreactor/experiments/{quote(self._experiment, safe='')}"
         try:
             self.send("PATCH", path, {"values": {"current_volume_ml": level_ml}})
@@ -82,10 +76,7 @@ class Web:
         return "" if said.get("is_active", 1) else "it is inactive"
 
     def result(self, task: str) -> bool | None:
-        """Whether the process that a task began may be there; False: it is over and failed; None: the task waits.
-
-        Some versions give the answer once, and then as if the task still waited. Raises: LinkError, ProtocolError.
-        """
+        """Whether a task's process may be there; None: it waits, or was asked before. Raises: as `get`."""
         try:
             answer = self.get(f"/task_results/{task}")
         except ProtocolError as error:
@@ -99,20 +90,14 @@ class Web:
         return answer["status"] != "failed" and result is not False
 
     def running(self) -> list[dict[str, Any]]:
-        """The vendor's list of running jobs; one whose process was killed stays in it.
-
-        Raises: LinkError, ProtocolError.
-        """
+        """The vendor's list of running jobs, and of killed ones. Raises: LinkError, ProtocolError."""
         jobs = self.get("/jobs/running")
         if not (isinstance(jobs, list) and all(isinstance(job, dict) and "job_name" in job for job in jobs)):
             raise ProtocolError(f"{self.url}: {str(jobs)[:60]} is no list of jobs")
         return jobs
 
     def send(self, method: str, path: str, body: Mapping[str, Any] | None, below: str = "/unit_api") -> Any:
-        """The answer's content; 202 to POST or PATCH says only that it was written down.
-
-        Raises: NotHeard when it cannot have been carried out; other LinkError and ProtocolError when that is unknown.
-        """
+        """The answer's content. Raises: NotHeard if it cannot have been carried out; other ReactorError if it may."""
         url, content = f"{self.url}{below}{path}", None if body is None else json.dumps(body).encode()
         try:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
