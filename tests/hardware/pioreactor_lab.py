@@ -227,9 +227,9 @@ class World(VirtualClock):
                 self.later(0.8, lambda: spell(not on))
             else:
                 self.pin("remove_waste", False)
-                self.over(job)
+                self.say(f"{job}/$state", "disconnected", experiment="another")
 
-        self.state(job, "ready")
+        self.say(f"{job}/$state", "ready", experiment="another")
         self.event("remove_waste", 20.0, "CLI")
         self.pin("remove_waste", True)
         spell(True)

@@ -28,7 +28,10 @@ def test_a_dose_is_written_down_then_media_then_twice_the_waste_with_one_id(lab)
     lab.wait(6.0)
     (media,), (waste,) = lab.asked("add_media"), lab.asked("remove_waste")
     assert (media["ml"], waste["ml"]) == (0.7, 1.4)
-    assert media["source-of-event"] == waste["source-of-event"]
+    assert media["source-of-event"] == waste["source-of-event"] == "turbidostat/run/pio01/1"
+    assert [(row["job"], row["id"]) for row in lab.of("task")] == [
+        (job, "turbidostat/run/pio01/1") for job in ("add_media", "remove_waste")
+    ]
     kinds = [row["kind"] for row in lab.rows if row["kind"] in ("intent", "feed_on", "dose_end")]
     assert kinds == ["intent", "feed_on", "dose_end"]
     (end,) = lab.of("dose_end")
@@ -192,14 +195,6 @@ def test_excesses_that_are_little_each_are_booked_once_they_are_much(lab):
     truth = lab.world.truth["add_media"]
     assert truth > planned + 0.5
     assert float(lab.ledger(planned).fed_ml[0]) == pytest.approx(truth, abs=LATE_ML + 0.02)
-
-
-def test_a_foreign_automation_forbids_the_dose(lab):
-    lab.world.say("dosing_automation/$state", "ready", experiment="another")
-    lab.wait(1.0)
-    assert lab.fault is not None
-    assert lab.fault.kind == "mode"
-    assert lab.dose(0.5) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -387,45 +382,11 @@ def test_five_times_faster_a_period_of_two_minutes_is_dosed_whole_and_an_old_sam
     assert "no dose: its sample is stale" in [row["note"] for row in lab.of("note")]
 
 
-def test_a_slow_pump_is_given_the_time_that_its_dose_takes(monkeypatch):
-    monkeypatch.setitem(FLOW, "add_media", 0.3)
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
-    assert lab.dose(1.5) == 1.5
-    lab.wait(15.0)
-    assert lab.given() == pytest.approx((1.5, 1.5), abs=0.02)
-    assert lab.world.truth["add_media"] == pytest.approx(1.5, abs=0.02)
-    assert lab.fault is None
-
-
 def test_pumps_off_while_a_run_goes_on_lets_the_waste_pump_end(lab):
     assert lab.dose(1.0) == 1.0
     lab.until(lambda: WASTE_PIN in lab.world.since, 10.0)
     assert lab.reactors.pumps_off(np.array([True])) == []
     assert lab.world.truth["remove_waste"] == pytest.approx(2.0, abs=0.05)
-
-
-class Unit:
-    """What is asked of a station, by unit."""
-
-    def __init__(self, name):
-        self.name, self.level_ml, self.asked = name, 0.0, []
-
-    def regulate(self, setpoint):
-        self.asked.append(setpoint)
-        yield 0.0
-
-    def go_on(self):
-        pass
-
-
-def test_each_unit_is_handed_over_at_its_own_setpoint_and_has_its_own_level(lab):
-    lab.reactors.stations = units = (Unit("pio01"), Unit("pio02"))
-    assert lab.reactors.regulate(np.array([True, True]), np.array([0.4, 0.7])) == []
-    assert [unit.asked for unit in units] == [[0.4], [0.7]]
-    lab.reactors.set_level(1, 14.5)
-    assert [unit.level_ml for unit in units] == [0.0, 14.5]
 
 
 def crashed(monkeypatch, first_s, speed=1.0):
@@ -439,17 +400,6 @@ def crashed(monkeypatch, first_s, speed=1.0):
     again = Lab(monkeypatch, lab.world, speed=speed)
     again.rows = list(lab.rows)
     return lab, again
-
-
-def test_after_a_crash_medium_that_still_waits_in_the_queue_is_waited_for(monkeypatch):
-    _, again = crashed(monkeypatch, 0.6)
-    world = again.world
-    again.begin(replay(again.rows)[UNIT], 60.0)
-    again.wait(30.0)
-    assert not again.of("dose_end")
-    world.revive()
-    again.until(lambda: bool(again.of("dose_end")), 120.0)
-    assert world.truth["add_media"] == pytest.approx(0.8, abs=0.02)
 
 
 def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put_off(lab):
@@ -466,16 +416,6 @@ def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put
         lab.sample()
     assert [row["doses"] for row in lab.of("intent")] == [0, 0, 1, 2, 3]
     assert [row["carry_ml"] for row in lab.of("intent")] == pytest.approx([0.03, 0.03, 0.0, 0.0, 0.0])
-
-
-def test_the_least_and_the_most_of_what_somebody_takes_back_is_what_is_left(lab):
-    """0.5 mL are told before they are pumped; of these 0.2 are taken back when it is stopped."""
-    lab.world.event("add_media", 0.5, "UI")
-    lab.world.event("add_media", -0.2, "UI")
-    lab.wait(1.0)
-    assert sum(row["feed_ml"] for row in lab.of("given")) == pytest.approx(0.3)
-    assert lab.fault is not None
-    assert "add_media of 0.30 mL without our command" in lab.fault.detail
 
 
 @pytest.mark.parametrize(("volume_ml", "rim_ml"), [(14.0, 20.0), (30.0, 40.0)])
@@ -533,18 +473,6 @@ def test_each_pump_s_flow_is_that_of_its_own_calibration_and_on_record(lab):
     (row,) = lab.of("device")
     assert row["flows"] == {"add_media": 0.7, "remove_waste": 1.6}
     assert (row["device_id"], row["boot"]) == (UNIT, "boot1")
-
-
-def test_a_dose_has_the_name_of_its_run_its_unit_and_its_number(lab):
-    lab.dose(0.2)
-    lab.sample()
-    lab.dose(0.3)
-    lab.wait(6.0)
-    first, second = (o["source-of-event"] for o in lab.asked("add_media"))
-    assert (first, second) == ("turbidostat/run/pio01/1", "turbidostat/run/pio01/2")
-    assert [row["id"] for row in lab.of("dose_end")] == [first, second]
-    assert {row["id"] for row in lab.of("task")} == {first, second}
-    assert [row["job"] for row in lab.of("task")] == ["add_media", "remove_waste"] * 2
 
 
 def test_after_a_crash_of_a_fast_run_a_dose_is_late_by_real_time(monkeypatch):

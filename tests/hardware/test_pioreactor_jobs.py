@@ -18,7 +18,6 @@ from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.family import FAMILY
 from hardware.pioreactor.jobs import flow, regulates, request
-from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
@@ -77,16 +76,6 @@ def test_a_resumed_run_heats_to_what_was_set_last_and_not_to_the_first_temperatu
     again.wait(10.0)
     assert again.station._box.target == 33.4
     assert started(again, "temperature_automation")[-1]["target-temperature"] == (33.4 if rebooted else 30.0)
-
-
-@pytest.mark.parametrize("job", ["stirring", "temperature_automation"])
-def test_what_never_came_up_is_a_fault(monkeypatch, job):
-    lab = Lab(monkeypatch, stirring=job == "stirring", thermostat=job != "stirring")
-    lab.world.barred = True
-    lab.begin()
-    lab.wait(30.0)
-    assert lab.fault is not None
-    assert lab.fault.kind == "stopped"
 
 
 def test_a_unit_that_was_given_up_is_regulated_by_nobody_any_more(lab):
@@ -204,47 +193,28 @@ def test_readings_are_asked_for_as_often_as_the_run_wants_them_and_without_smoot
         ]
 
 
-def test_only_what_a_unit_says_itself_is_a_sign_of_its_life() -> None:
-    """Not what others tell a job; nor what the broker says of one that died, or retained."""
-    clock = VirtualClock(100.0)
-    box = Mailbox("pio01", PioreactorConfig(), clock)
-    below = "pioreactor/pio01/turbidostat/"
-    for job, payload, alive in (
-        ("stirring/$state", b"ready", True),
-        ("stirring/duty_cycle/set", b"30", False),
-        ("add_media/$state/set", b"disconnected", False),
-        ("temperature_automation/temperature", b'{"temperature": 36.5}', True),
-    ):
-        before = box.heard_s
-        clock.sleep(5.0)
-        box.take(below + job, payload, False)
-        assert (job, box.heard_s) == (job, clock.now() if alive else before)
-
-
 class Said:
     """A unit's answers, and that its queue takes what is written down."""
 
     url = "http://pio02.local"
 
-    def __init__(self, channels: dict[str, str], tube: str) -> None:
+    def __init__(self, channels: dict[str, str], tube: str, jobs: tuple[str, ...] = (), **answers: Any) -> None:
+        self.jobs, self.answers = jobs, answers
         self.settings = {"od_config.photodiode_channel": channels, "bioreactor": {"efflux_tube_volume_ml": tube}}
         self.settings["PWM"] = {"1": "stirring", "2": "media", "3": "alt_media", "4": "waste", "5": "heating"}
 
     def get(self, path: str, below: str = "/unit_api") -> Any:
-        curve = {"curve_data_": {"type": "poly", "coefficients": [0.7, 0.0]}}
+        curves = {"media_pump": {"curve_data_": [0.7, 0.0]}, "waste_pump": {"curve_data_": [1.6, 0.0]}}
         return {
-            "/health": {"pioreactor_unit": "pio02", "utc_time": "2026-11-21T00:00:00Z"},
-            "/versions/app": {"version": "26.7.2"},
-            "/workers/pio02/experiment": {"experiment": "turbidostat"},
-            "/active_calibrations": {"media_pump": curve, "waste_pump": curve},
-            "/config/merged": self.settings,
-        }[path]
+            "health": {"pioreactor_unit": "pio02", "utc_time": "2026-11-21T00:00:00Z"}, "app": {"version": "26.7.2"},
+            "experiment": {"experiment": "turbidostat"}, "active_calibrations": curves, "merged": self.settings,
+        }[name := path.rpartition("/")[2]] | self.answers.get(name, {})  # fmt: skip
 
     astray = Web.astray
     _experiment = "turbidostat"
 
     def running(self) -> list[dict[str, Any]]:
-        return []
+        return [{"job_name": job} for job in self.jobs]
 
     def run(self, job: str, *_options: Any) -> str:
         return "task"
@@ -425,26 +395,13 @@ def test_a_turbidostat_regulates_only_by_what_it_was_asked_for():
     assert not regulates({"error": "no such job"}, asked)
 
 
-class Wrong(Said):
-    """A unit of which nothing is as a run needs it; its two pumps are not alike."""
-
-    def get(self, path: str, below: str = "/unit_api") -> Any:
-        curve = {"media_pump": {"curve_data_": [0.7, 0.0]}, "waste_pump": {"curve_data_": [1.6, 0.0]}}
-        return {
-            "/health": {"pioreactor_unit": "pio09", "utc_time": "2001-11-21T00:00:00Z"},
-            "/versions/app": {"version": "26.1.30"},
-            "/workers/pio02/experiment": {"experiment": "older"},
-            "/active_calibrations": curve,
-            "/config/merged": self.settings,
-        }[path]
-
-    def running(self) -> list[dict[str, Any]]:
-        return [{"job_name": job} for job in ("od_reading", "circulate_media", "add_alt_media", "stirring")]
-
-
 def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     config = PioreactorConfig(reactors=("pio01", "pio02"), max_dose_ml=1.2)
-    web: Any = Wrong({"1": "90", "2": "REF", "3": "135"}, "20")
+    web: Any = Said(
+        {"1": "90", "2": "REF", "3": "135"}, "20", ("od_reading", "circulate_media", "add_alt_media", "stirring"),
+        health={"pioreactor_unit": "pio09", "utc_time": "2001-11-21T00:00:00Z"}, app={"version": "26.1.30"},
+        experiment={"experiment": "older"},
+    )  # fmt: skip
     unit = SimpleNamespace(web=web, leader=web, config=config.of("pio02"), volume_ml=14.0)
     mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
     web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}

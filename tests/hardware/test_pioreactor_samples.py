@@ -116,7 +116,7 @@ def word(rng):
 RESTS = [
     "od_reading/ods", "dosing_events", "pwms/dc", "stirring/duty_cycle", "temperature_automation/temperature",
     "temperature_automation/target_temperature", "add_media/$state", "od_reading/$state", "stirring/$state",
-    "dosing_automation/$state", "x", "", "//", "$state",
+    "dosing_automation/$state", "pwms/channel_dc", "", "//", "$state",
 ]  # fmt: skip
 
 
@@ -169,16 +169,6 @@ def test_readings_of_another_experiment_or_unit_are_not_ours():
     assert box.drain()[0] == []
 
 
-def test_duties_of_our_experiment_count_retained_and_those_of_others_only_as_they_are_said():
-    box, duty = mailbox(), json.dumps({"13": 100.0, "17": 30.0}).encode()
-    box.take(f"pioreactor/{UNIT}/other/pwms/dc", duty, True)
-    assert box.on() == []
-    box.take(f"pioreactor/{UNIT}/{EXPERIMENT}/pwms/dc", duty, True)
-    assert box.on() == [13]
-    box.take(f"pioreactor/{UNIT}/other/pwms/dc", b"{}", False)
-    assert box.on() == []
-
-
 def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
     sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     values = [0.60, 0.61, 0.59, 2.0, 0.60]
@@ -189,15 +179,6 @@ def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
     assert sample.od == pytest.approx(2.0 * (0.60 - 0.1))
     assert sample.spread == pytest.approx(2.0 * 1.4826 * 0.01 / np.sqrt(5.0))
     assert sample.at == pytest.approx(42.0)
-
-
-def test_readings_in_or_just_after_a_dose_do_not_count():
-    sampling = Sampling(PioreactorConfig(), 60.0, 0.0)
-    sampling.take([Reading(float(k), 0.5 if k < 20 else 0.4) for k in range(10, 30)])
-    assert sampling.look(29.0, 28.5) is None
-    sample = sampling.look(29.0, 20.0)
-    assert sample is not None
-    assert sample.od == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("late_s", [1, 7])
@@ -254,12 +235,6 @@ def test_a_wrong_value_is_named(values, named):
         PioreactorConfig(**values)
 
 
-def test_addresses_have_a_default():
-    config = RigBackendConfig(units={"pio01": UnitConfig(address="http://10.0.0.1/")})
-    assert config.address("pio01") == "http://10.0.0.1"
-    assert config.address("pio02") == "http://pio02.local"
-
-
 def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_decides(monkeypatch):
     lab = Lab(monkeypatch)
     lab.begin()
@@ -289,6 +264,8 @@ def test_two_units_have_their_own_values(monkeypatch):
     sampling = Sampling(config.of("pio02"), 60.0, 0.0)
     sampling.take([reading, reading])
     assert sampling.look(6.0, 0.0).od == pytest.approx(2.5 * 0.4)
+    config = RigBackendConfig(units={"pio01": UnitConfig(address="http://10.0.0.1/")})
+    assert [config.address(name) for name in ("pio01", "pio02")] == ["http://10.0.0.1", "http://pio02.local"]
     for leader, address in (("", "http://lead.local"), ("http://10.0.0.9/", "http://10.0.0.9")):
         assert PioreactorConfig(broker="lead.local", leader=leader).leader_address == address
 
@@ -328,6 +305,9 @@ def test_what_a_unit_says_of_its_heat_and_its_pumps_is_read_by_its_own_names():
         box.take(below + topic, payload.encode(), False)
         box.take(below.replace(EXPERIMENT, "older") + topic, b"99", False)
     assert (box.temperature, box.target, box.stir_duty) == (36.2, 31.5, 28.0)
+    heard_s, box._clock = box.heard_s, VirtualClock(9.0)
+    box.take(f"{below}stirring/duty_cycle/set", b"30", False)
+    assert box.heard_s == heard_s, "what others say to a job is no sign of its unit's life"
     assert (box.jobs, box.dc_s) == ({"add_media": 5, "add_alt_media": 6, "remove_waste": 9}, 7.0)
     box.take(f"{below}remove_waste/$state", b"ready", False)
     box.take(f"{below}pwms/dc", b'{"9": 100.0}', False)
@@ -379,23 +359,3 @@ def test_a_bench_is_such_as_units_may_have(bench, words):
     else:
         with pytest.raises(UnfitError, match=words):
             PioreactorFamily().doses(backend, given)
-
-
-def test_who_else_controls_a_unit_is_named_with_what_clears_it_and_nobody_of_another_unit():
-    link = Cluster.__new__(Cluster)
-    link._boxes, link._lock, link._others = {"pio02": mailbox()}, f"{LOCKS}us", {}
-
-    def said(name, *units):
-        return json.dumps({"host": f"lab-{name}", "pid": 7, "units": units}).encode() if units else b""
-
-    for name, units in (("us", ["pio02"]), ("they", ["pio01", "pio02"]), ("others", ["pio09"])):
-        link._message(f"{LOCKS}{name}", said(name, *units), True)
-    assert link.holder("pio02") == (
-        "process 7 on lab-they controls pio02: one client per unit; if it is not there any more: "
-        f"mosquitto_pub -r -n -t {LOCKS}they"
-    )
-    assert link.holder("pio09").startswith("process 7 on lab-others controls pio09")
-    link._message(f"{LOCKS}they", said("they", "pio01"), True)
-    assert (link.holder("pio02"), bool(link.holder("pio01"))) == ("", True)
-    link._message(f"{LOCKS}others", said("others"), True)  # it left, or died: the broker clears it
-    assert link.holder("pio09") == ""

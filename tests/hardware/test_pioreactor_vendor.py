@@ -80,12 +80,9 @@ def test_a_unit_of_the_rig_cannot_shut_this_computer_down(bench):
     assert subprocess.run([found, "true"], check=False).returncode == 1
 
 
-def test_a_sample_is_the_culture_s(bench):
+def test_a_sample_is_the_culture_s_and_a_dose_reaches_it_once_and_as_much_leaves_it(bench, monkeypatch):
     assert bench.sample(LONG_S)
     assert bench.station.sampling.newest.od == pytest.approx(bench.od(), abs=0.02)
-
-
-def test_a_dose_reaches_the_vial_once_and_as_much_leaves_it(bench, monkeypatch):
     jobs, before = asked_for(bench, monkeypatch), bench.pulses()
     assert bench.dose(0.8) == 0.8
     assert bench.settled(LONG_S)

@@ -3,16 +3,13 @@
 What a unit does is judged by the vial.
 """
 
-import importlib
 import json
 import os
 import signal
 import subprocess
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -20,12 +17,12 @@ import pytest
 
 from envs.plant.plant import Plant
 from hardware.clock import RealClock
-from hardware.pioreactor.config import PioreactorConfig, RigConfig, vial_ml
+from hardware.pioreactor.config import PioreactorConfig, RigConfig
 from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.pioreactor.versions import TESTED, Facts, facts
 from hardware.pioreactor.web import NotHeard, Web
 from hardware.rig import build
-from hardware.rig.files import LOGIN, flows
+from hardware.rig.files import flows
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
 from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig, started
 
@@ -51,18 +48,6 @@ class Asked:
         self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
         self.web = Web(self.rig.web[UNIT], "e1", 20.0)
 
-    def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
-        """Status and content of an answer."""
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(f"{self.rig.web[UNIT]}{path}", data, method=method)
-        request.add_header("Content-Type", "application/json")
-        try:
-            with urllib.request.urlopen(request, timeout=20.0) as answer:
-                return answer.status, json.load(answer)
-        except urllib.error.HTTPError as error:
-            with error:
-                return error.code, error.read()
-
     def reached(self) -> PioreactorConfig:
         """How the driver reaches it."""
         return PioreactorConfig(reactors=(UNIT,), experiment="e1", broker="127.0.0.1", broker_port=self.rig.broker)
@@ -84,23 +69,19 @@ class Asked:
 
     def finished(self, task: str) -> bool | None:
         """What the driver makes of a task that is over."""
-        said: list[bool | None] = []
-
-        def over() -> bool:
-            said.append(self.web.result(task))
-            return said[-1] is not None
-
-        assert until(over)
+        said: list[bool | None] = [None]
+        assert until(lambda: said.append(self.web.result(task)) or said[-1] is not None)
         return said[-1]
 
     def jobs(self) -> list[str]:
         """Names of the jobs that the unit lists."""
-        return [job["job_name"] for job in self.ask("GET", "/unit_api/jobs/running")[1]]
+        return [job["job_name"] for job in self.web.running()]
 
     def settings(self, job: str) -> dict[str, Any]:
         """Of a running job; none of one that does not run."""
-        status, said = self.ask("GET", f"/unit_api/jobs/settings/job_name/{job}")
-        return said["settings"] if status == 200 else {}
+        with suppress(NotHeard):
+            return self.web.get(f"/jobs/settings/job_name/{job}")["settings"]
+        return {}
 
     def fed_ml(self) -> float:
         return float(self.vial.plant.feed.delivered_ml[0])
@@ -136,12 +117,6 @@ def unit(request: pytest.FixtureRequest) -> Iterator[Asked]:
         yield made
     finally:
         made.rig.__exit__()
-
-
-@rig
-def test_the_unit_says_its_version(unit):
-    assert unit.ask("GET", "/unit_api/versions/app")[1] == {"version": unit.rig.version}
-    assert unit.rig.version in TESTED
 
 
 @rig
@@ -252,14 +227,14 @@ def test_a_turbidostat_takes_the_option_of_the_table_and_no_other(unit):
 
 @rig
 def test_the_unit_keeps_a_ledger_that_can_be_set_where_the_table_says_so(unit):
-    route = "/unit_api/bioreactor/experiments/e1"
-    status, said = unit.ask("GET", route)
-    assert status == (200 if unit.known.ledger else 404)
+    route = "/bioreactor/experiments/e1"
     if not unit.known.ledger:
+        with pytest.raises(NotHeard, match="status 404"):
+            unit.web.get(route)
         return
-    assert said["values"][unit.known.tube] == 14.0
-    assert unit.ask("PATCH", route, {"values": {"current_volume_ml": 14.5}})[0] == 200
-    assert unit.ask("GET", route)[1]["values"]["current_volume_ml"] == 14.5
+    assert unit.web.get(route)["values"][unit.known.tube] == 14.0
+    assert unit.web.set_level(14.5) == ""
+    assert unit.web.get(route)["values"]["current_volume_ml"] == 14.5
     before = unit.fed_ml()
     with pytest.raises(NotHeard, match="status 400"):  # 18 mL is the most in a vial of 20
         unit.run("add_media", {"ml": 3.5})
@@ -268,26 +243,10 @@ def test_the_unit_keeps_a_ledger_that_can_be_set_where_the_table_says_so(unit):
 
 @rig
 def test_the_leader_says_which_experiment_a_unit_is_in(unit):
-    assert unit.ask("GET", f"/api/workers/{UNIT}/experiment")[1]["experiment"] == "e1"
-    assert unit.ask("GET", "/api/workers/pio09/experiment")[0] == 404
-    assert unit.ask("GET", "/api/experiments/e2")[0] == 404
-
-
-@pytest.mark.parametrize("password", ["wrong", LOGIN[1]])
-@rig
-def test_the_broker_wants_the_password(unit, password):
-    paho = importlib.import_module("paho.mqtt.client")
-    client, said = paho.Client(paho.CallbackAPIVersion.VERSION2), []
-    client.username_pw_set(LOGIN[0], password)
-    client.on_connect = lambda _c, _u, _f, reason, _p: said.append(bool(reason.is_failure))
-    client.connect("127.0.0.1", unit.rig.broker)
-    client.loop_start()
-    try:
-        assert until(lambda: bool(said))
-    finally:
-        client.disconnect()
-        client.loop_stop()
-    assert said[0] is (password == "wrong")
+    other = Web(unit.rig.web[UNIT], "e2", 20.0)
+    assert [bool(web.astray(name)) for web, name in ((unit.web, UNIT), (unit.web, "pio09"), (other, UNIT))] == [
+        False, True, True,
+    ]  # fmt: skip
 
 
 # -- the heater, by itself -----------------------------------------------------------------------------------------
@@ -383,8 +342,3 @@ def test_a_newer_version_on_the_package_index_is_told_in_a_line_and_nothing_with
     monkeypatch.setattr(build.subprocess, "run", lambda *_given, **_how: subprocess.CompletedProcess([], 1, said, ""))
     line = build.newer()
     assert (told in line, bool(line), "\n" in line) == (True, bool(told), False)
-
-
-@pytest.mark.parametrize(("volume_ml", "vial"), [(14.0, 20), (20.0, 40), (35.0, 40)])
-def test_a_vial_is_large_enough_for_its_culture(volume_ml, vial):
-    assert vial_ml(volume_ml) == vial
