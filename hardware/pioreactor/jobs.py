@@ -10,6 +10,7 @@ from hardware.pioreactor.versions import Facts
 __all__ = ["AUTOMATION", "GONE", "HEAT", "OD", "STIR", "flow", "regulates", "request", "target_of"]
 
 OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring", "dosing_automation"
+Asked = tuple[dict[str, Any], list[list[str]]]
 EXCHANGE_ML = 1.0  # of the vendor's turbidostat
 GONE = {OD: "takes no OD readings", HEAT: "does not heat", STIR: "does not stir", AUTOMATION: "does not regulate"}
 """What is said of a unit on which a job ended although it should run."""
@@ -20,9 +21,7 @@ def target_of(config: PioreactorConfig, facts: Facts, setpoint: float) -> dict[s
     return {facts.target: setpoint / config.od_scale + config.od_zero, **dict(facts.signal)}
 
 
-def request(
-    job: str, config: PioreactorConfig, facts: Facts, temperature: float, setpoint: float
-) -> tuple[dict[str, Any], list[list[str]]]:
+def request(job: str, config: PioreactorConfig, facts: Facts, temperature: float, setpoint: float) -> Asked:
     """Options and overrides of its configuration that a job is asked for with: of thermostat and turbidostat, too."""
     if job == OD:
         rate = str(round(1.0 / config.reading_s, 4))
@@ -39,11 +38,8 @@ def request(
 def regulates(settings: Any, asked: dict[str, Any]) -> bool:
     """Whether the settings of the vendor's turbidostat are those that it was asked for with."""
     try:
-        said = {key: settings["settings"][key.replace("-", "_")] for key in asked}
-        return all(
-            abs(float(said[key]) - value) <= 1e-6 if isinstance(value, float) else said[key] == value
-            for key, value in asked.items()
-        )
+        pairs = [(settings["settings"][key.replace("-", "_")], value) for key, value in asked.items()]
+        return all(abs(float(a) - b) <= 1e-6 if isinstance(b, float) else a == b for a, b in pairs)
     except (KeyError, TypeError, ValueError):
         return False
 

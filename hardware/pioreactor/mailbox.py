@@ -188,9 +188,7 @@ class Mailbox:
             pin.run_s = at
         elif word == "disconnected":
             pin.ended_s = at
-            if (
-                pin.on_s >= pin.run_s or pin.run_s <= pin.event_s < math.inf
-            ):  # its own word on the pin may come a moment later, or was overtaken
+            if pin.on_s >= pin.run_s or pin.run_s <= pin.event_s < math.inf:  # the word on its pin may be overtaken
                 pin.ends(at)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
@@ -226,8 +224,8 @@ class Mailbox:
     def live(self, job: str) -> bool:
         """Whether a job of this name is there: in our experiment, or heard of in another one since we listen."""
         with self.lock:
-            known = [(e, s) for (e, name), s in self.states.items() if name == job]
-        return any(s.word in LIVE and (e == self._experiment or s.at > -math.inf) for e, s in known)
+            known = [(s, e == self._experiment) for (e, name), s in self.states.items() if name == job]
+        return any(s.word in LIVE and (mine or s.at > -math.inf) for s, mine in known)
 
     def driven(self, job: str) -> bool:
         """Whether a job is there that drives a pump: its own, or one that drives several."""

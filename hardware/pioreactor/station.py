@@ -139,8 +139,8 @@ class Station:
         if rows := self._calls.ask("rows", GRACE_S / 2.0, self._web.running):
             self._listed = {str(row["job_name"]) for row in rows[0]}
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
-                self._pumps.boot = boot = boot_of(rows[0])
-                self.book.log("device", device_id=self.name, url=self._web.url, boot=boot)
+                self._pumps.boot = boot_of(rows[0])
+                self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
         if said := self._leads.ask("assigned", GRACE_S / 2.0, self.unit.leader.astray, self.name):
             self._astray = said[0]
         unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
@@ -165,11 +165,11 @@ class Station:
         self.book.report(self._wrong())
         if found is None:
             return False
-        age = self._clock.now() - found.at
-        self.book.log(
-            "sample", sample_s=round(self.book.elapsed() - age, 3), od=found.od, spread=found.spread,
-            readings=found.number, temperature=self._box.temperature,
-        )  # fmt: skip
+        at, seen = (
+            round(self.book.elapsed() - (self._clock.now() - found.at), 3),
+            {"temperature": self._box.temperature},
+        )
+        self.book.log("sample", sample_s=at, od=found.od, spread=found.spread, **seen)
         return True
 
     @property
@@ -241,11 +241,10 @@ class Station:
             return False
         if self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S:
             self._gone.add(job)
-            self._asked_s[job] = self._real.now()
             ended = job != OD and self._box.state(job).word == "disconnected" and job in self._been
-            if not (ended and job in self._ended):
-                self._course = self._course or self._again(job)
-            self._ended |= {job} if ended else set()
+            if self._course is None and not (ended and job in self._ended):
+                self._asked_s[job], self._course = self._real.now(), self._again(job)
+                self._ended |= {job} if ended else set()
         return job in self._gone
 
     def _again(self, job: str) -> Iterator[float]:

@@ -30,7 +30,6 @@ pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  
 rig = pytest.mark.slow
 
 LONG_S = 60.0  # a deadline that a busy computer meets
-TARGETS = {"target-od", "target-biomass"}
 
 
 def until(holds: Callable[[], bool]) -> bool:
@@ -211,7 +210,7 @@ def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_comma
 @rig
 def test_a_turbidostat_takes_the_option_of_the_table_and_no_other(unit):
     name = {"automation-name": "turbidostat", "exchange-volume-ml": 1.0}
-    (other,) = TARGETS - {unit.known.target}
+    (other,) = {"target-od", "target-biomass"} - {unit.known.target}
     unit.finished(unit.run("dosing_automation", name | {other: 9.0}))
     assert until(lambda: "dosing_automation" not in unit.jobs())
     unit.run("dosing_automation", name | {unit.known.target: 9.0} | dict(unit.known.signal))
