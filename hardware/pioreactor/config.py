@@ -17,8 +17,6 @@ PUBLISHED = "26.11.1"
 """Version of the vendor's software that the rig runs, the newest that was tried."""
 FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's most in each vial
 
-JOB_WAIT_S = 12.0  # real seconds in which an accepted job must have shown itself
-
 
 def vial_ml(volume_ml: float) -> int:
     """The vendor's vial for a culture of this volume, mL."""
@@ -45,44 +43,30 @@ class PioreactorConfig:
 
     kind: str = setting("pioreactor", "which backend")
     reactors: tuple[str, ...] = setting(("pio01",), "names of the units, as in the vendor's page", some=True)
-    units: dict[str, UnitConfig] = setting(
-        {}, "what single units have otherwise, e.g. units.pio01.address=http://10.42.0.2 or units.pio02.channel=1"
-    )
+    units: dict[str, UnitConfig] = setting({}, "what single units have otherwise, e.g. units.pio02.channel=1")
     broker: str = setting("pioreactor.local", "host of the cluster's MQTT broker, its leader")
     broker_port: int = setting(1883, "of the broker", within=(1, 65535))
     username: str = setting("pioreactor", "of the broker")
-    password_file: str = setting(
-        "", f"file with the broker's password, mode 600; '': {PASSWORD} of the environment, else the vendor's own"
-    )
+    password_file: str = setting("", f"file with its password, mode 600; '': {PASSWORD}, else the vendor's own")
     tls: bool = setting(False, "encrypt the way to the broker")
     ca_file: str = setting("", "certificate of who signed the broker's; '': those of this computer", note="with tls")
     leader: str = setting("", "address of the leader's web server; '': http://BROKER")
     experiment: str = setting("turbidostat", "name of the experiment in the vendor's pages and data")
-    speed: float = setting(
-        1.0, "growth faster than real time, only in the rig: device seconds per real second", within=(1, 60)
-    )
+    speed: float = setting(1.0, "growth faster than real time, only in the rig", within=(1, 60))
     reading_s: float = setting(5.0, "real time between the vendor's readings", "s", within=(1, 30))
     window_s: float = setting(30.0, "a sample is the median of the readings of at most so long", "s", within=(5, 300))
     mix_s: float = setting(5.0, "after a dose no reading counts for so long", "s", within=(0, 60))
     channel: str = setting("2", "photodiode that shows the culture", choices=("1", "2", "3", "4"))
-    od_zero: float = setting(
-        0.0, "the vendor's reading of clear medium", within=(-10, 10), note="0 where a calibration is active"
-    )
-    od_scale: float = setting(
-        1.0, "OD per unit of the vendor's reading", above=0.0, at_most=1000.0, note="1 where a calibration is active"
-    )
+    od_zero: float = setting(0.0, "reading of clear medium; 0 where a calibration is active", within=(-10, 10))
+    od_scale: float = setting(1.0, "OD per unit of reading; 1 where one is active", above=0.0, at_most=1000.0)
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
     thermostat: bool = setting(True, "run the vendor's thermostat; else temperatures are not controlled")
     stirring: bool = setting(True, "run the vendor's stirring")
-    min_dose_ml: float = setting(
-        0.05, "less is put off to the next dose: the pump does not give it well", "mL", within=(0, 1)
-    )
+    min_dose_ml: float = setting(0.05, "less is put off to the next dose", "mL", within=(0, 1))
     max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
     waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
-    start_s: float = setting(
-        JOB_WAIT_S, "real time in which an accepted dose must begin; later its fate is unknown", "s", within=(2, 120)
-    )
+    start_s: float = setting(12.0, "real time in which an accepted dose must begin", "s", within=(2, 120))
     stop_s: float = setting(30.0, "real time a stop tries to verify the pumps off", "s", within=(1, 600))
 
     def __post_init__(self) -> None:

@@ -22,6 +22,8 @@ from hardware.reactor import Array, Reactor, left_off
 
 __all__ = ["FAMILY", "PioreactorFamily"]
 
+Reached = AbstractContextManager[PioreactorConfig]
+
 
 class PioreactorFamily(Family):
     """Units of one cluster."""
@@ -30,9 +32,7 @@ class PioreactorFamily(Family):
     can = Can(thermostat=True, regulation=True, resume=True)
     called = "Pioreactors"
 
-    def reached(
-        self, backend: PioreactorConfig, bench: Bench, folder: Path
-    ) -> AbstractContextManager[PioreactorConfig]:
+    def reached(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> Reached:
         """The config by which the units are reached for as long as the run lasts. Raises: ReactorError."""
         return nullcontext(backend)
 

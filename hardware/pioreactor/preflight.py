@@ -50,7 +50,7 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     said = datetime.fromisoformat(str(health.get("utc_time")).replace("Z", "+00:00")).timestamp()
     off = f"{(error_s := said - time.time()):+.1f} s against this computer"
     yield Check(f"{name} clock", abs(error_s) < CLOCK_S, off, "only its logs suffer", required=False)
-    yield _experiment(name, config.experiment, unit.leader)
+    yield (experiment := _experiment(name, config.experiment, unit.leader))
     calibrations = web.get("/active_calibrations")
     for pump in ("media_pump", "waste_pump"):
         try:
@@ -84,7 +84,7 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
     yield _queue(name, web)
-    yield _pins(station)
+    yield from [_pins(station)] if experiment.ok else ()  # of another one it tells us nothing
     largest = f"the vendor has no limit of one dose; ours is {config.max_dose_ml:g} mL"
     yield Check(f"{name} dead man", True, f"{largest}, and every pump job times itself")
 

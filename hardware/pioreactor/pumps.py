@@ -37,7 +37,7 @@ ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
 NUDGE = 0.01  # of a duty, %: nobody sees it
 SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
 AGAIN_S = 15.0  # between two of them
-DRAIN_ML = 4.0  # at a time, while a media pump cannot be stopped
+DRAIN_ML = 4.0  # at a time and more where it falls behind, while a media pump cannot be stopped
 
 Steps = Generator[float, None, T]
 """A course that yields what to wait, s, and returns T."""
@@ -306,7 +306,8 @@ class Pumps:
                 self.waits = late or self.waits
                 wanted = self.config.waste_factor * flowed - drained
                 if late and drain is None and job == MEDIA and not self.halted and wanted > DRAIN_ML:
-                    drain = self.give(WASTE, DRAIN_ML, f"{request.dose}/beside{self.clock.now():.0f}")
+                    portion_ml = max(DRAIN_ML, 0.5 * wanted * (flowed > drained + DRAIN_ML))
+                    drain = self.give(WASTE, portion_ml, f"{request.dose}/beside{self.clock.now():.0f}")
             yield STEP_S
         self.trouble, self.waits = "", False
         self.proven[job] = self.clock.now()

@@ -165,11 +165,9 @@ class Station:
         self.book.report(self._wrong())
         if found is None:
             return False
-        at, seen = (
-            round(self.book.elapsed() - (self._clock.now() - found.at), 3),
-            {"temperature": self._box.temperature},
-        )
-        self.book.log("sample", sample_s=at, od=found.od, spread=found.spread, **seen)
+        t, c = self.book.elapsed() - self._clock.now() + found.at, self._box.temperature
+        r = found.number
+        self.book.log("sample", sample_s=round(t, 3), od=found.od, spread=found.spread, readings=r, temperature=c)
         return True
 
     @property

@@ -70,9 +70,7 @@ def newer() -> str:
     found = re.match(r"pioreactor \(([\d.]+)\)", said)
     if found is None or number(found[1]) <= number(TESTED[-1]):
         return ""
-    return (
-        f"version {found[1]} of the vendor's software is on the package index; the newest that was tried: {TESTED[-1]}"
-    )
+    return f"the package index has version {found[1]} of the vendor's software, which was tried up to {TESTED[-1]}"
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:
