@@ -252,7 +252,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
 def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
     state = json.loads(json.dumps(Interlock(2).state()))
     assert set(state) == {
-        "volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable",
+        "volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_paid_ml", "_unusable",
         "_fresh_s", "_seen", "_repeats",
         "_od", "_at", "_since_ml", "_since_low_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
         "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",

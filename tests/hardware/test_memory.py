@@ -43,7 +43,7 @@ LAWS = {
 }
 ANEW = {"_fresh_s"}  # of the interlock: begins anew in a resumed run
 BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them than type and shape
-LATER = {"one_line", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
+LATER = {"one_line", "_paid_ml", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
 STREAM: dict[str, Any] = dict(np.random.default_rng(0).bit_generator.state)
 PATH = tuple[Any, ...]
 ONCE = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
