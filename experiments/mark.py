@@ -64,7 +64,8 @@ class MarkConfig:
 
 def _minute_now(folder: Path, stored: Any) -> float:
     """Return the minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
-    from hardware.family import elapsed_s, family, known  # and with it the plant, only for this
+    from hardware.clock import run_time
+    from hardware.family import family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
     over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
@@ -76,11 +77,11 @@ def _minute_now(folder: Path, stored: Any) -> float:
     if not rows:
         raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
     speed = OmegaConf.select(stored, "backend.speed")  # an emulated device may run faster
-    return elapsed_s(rows, 1.0 if speed is None else float(speed)) / 60.0
+    return run_time(rows, 1.0 if speed is None else float(speed)).s / 60.0
 
 
 def _latest(folder: Path, stored: Any) -> float:
-    """Return the minute up to which a run has come."""
+    """The minute up to which a run has come."""
     try:
         return _minute_now(folder, stored)
     except frame.UserError:
@@ -121,7 +122,7 @@ def _body(config: MarkConfig, folder: Path) -> None:
 
 
 def _quoted(argument: str) -> str:
-    """Return a text as it was typed, whatever Hydra's grammar would make of it."""
+    """A text as it was typed, whatever Hydra's grammar would make of it."""
     key, _, value = argument.partition("=")
     if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
         return argument

@@ -1,9 +1,16 @@
-"""Time as an argument: real time, device time, and a clock that moves only when somebody sleeps."""
+"""Time as an argument: real time, device time, a clock that moves only when somebody sleeps; the time of a run."""
 
+import math
 import time
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-__all__ = ["Clock", "DeviceClock", "RealClock", "VirtualClock"]
+__all__ = ["Clock", "DeviceClock", "RealClock", "RunTime", "VirtualClock", "boot", "run_time", "uptime"]
+
+STEP_S = 30.0
+"""Real seconds by which the clock of the day may differ from what is known of the time before that is told."""
 
 
 class Clock(Protocol):
@@ -79,3 +86,51 @@ class VirtualClock:
         """Advance virtual time."""
         if seconds > 0.0:
             self._now += seconds
+
+
+def boot() -> str:
+    """Return the name of this computer's present boot, "" where the system does not tell."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return ""
+
+
+def uptime() -> float:
+    """Return real seconds on a clock that nobody sets, and that goes on while the computer sleeps where it can."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+class RunTime(NamedTuple):
+    """Run time, s, at least low_s and at most high_s; step_s: real seconds by which the clock of the day is off it."""
+
+    s: float
+    low_s: float
+    high_s: float
+    step_s: float = 0.0
+
+
+def run_time(
+    rows: Sequence[Mapping[str, Any]], speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf
+) -> RunTime:
+    """Return the time of a run by all that is known: the one place where the clock of the day is believed or not.
+
+    Time is counted on from the newest row that says its run time. In the boot in which that was written, the clock that
+    nobody sets tells how long ago it was; after another one only the clock of the day does, which may have been set.
+    Neither is believed outside the bounds, and the run never goes back.
+
+    Args: rows: of its journal. speed: device seconds per real second; 0: virtual time, which stands still while no
+      program runs. low_s, high_s: bounds on the run time by the devices.
+    """
+    last = max(rows, key=lambda row: float(row.get("time_s") or 0.0), default={})
+    known_s = float(last.get("time_s") or 0.0)
+    if not last or not speed:
+        return RunTime(known_s, known_s, known_s)
+    passed = {"wall": time.time() - float(last["wall"])}
+    if [row.get("boot") for row in rows if row["kind"] == "start"][-1:] == [boot()] != [""]:
+        passed = {"mono": uptime() - float(last["mono"]), **passed}
+    clock, low_s = DeviceClock(speed), max(known_s, low_s)
+    found = [known_s + clock.of_real(real_s) for real_s in passed.values()]
+    s = next((s for s in found if low_s <= s <= high_s), max(min(found[0], high_s), low_s))
+    exact = "mono" in passed and s == found[0]
+    step_s = passed["wall"] - clock.to_real(s - known_s)
+    return RunTime(s, s if exact else low_s, s if exact else high_s, step_s if abs(step_s) > STEP_S else 0.0)

@@ -22,12 +22,12 @@ from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from hardware.check import Check
-from hardware.clock import DeviceClock
+from hardware.clock import run_time
 from hardware.errors import ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
 
-__all__ = ["Can", "Family", "Opening", "add", "elapsed_s", "family", "family_of", "known", "not_looked_at"]
+__all__ = ["Can", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at"]
 
 log = logging.getLogger(__name__)
 
@@ -45,16 +45,6 @@ class Can:
     thermostat: bool = False
     regulation: bool = False
     resume: bool = False
-
-
-def elapsed_s(rows: Sequence[Mapping[str, Any]], speed: float = 1.0) -> float:
-    """Return the run time that has passed, s, by the rows of the run's journal; 0 without rows.
-
-    Args: speed: device seconds per real second; 0: virtual time, which stands still while no program runs.
-    """
-    if not rows or not speed:
-        return max((float(row.get("time_s") or 0.0) for row in rows), default=0.0)
-    return DeviceClock(speed).of_real(time.time() - float(rows[0]["wall"]))
 
 
 @dataclass(frozen=True)
@@ -84,9 +74,16 @@ class Opening:
         """When the run began, s since 1970."""
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
-    def elapsed_s(self, speed: float = 1.0) -> float:
-        """Return the run time that has passed, s; 0 in a new run. Args: speed: as of `elapsed_s`."""
-        return elapsed_s(self.journal.rows, speed)
+    def elapsed_s(self, speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf) -> float:
+        """Return the run time that has passed, s; 0 in a new run. Args: as of `run_time`, which is told if in doubt."""
+        found = run_time(self.journal.rows, speed, low_s, high_s)
+        if found.step_s:
+            moved = f"this computer's clock moved by {found.step_s / 60.0:.1f} min since the run's last row"
+            log.warning("%s: the run goes on at minute %.1f, without that step", moved, found.s / 60.0)
+            self.journal.append("clock", {"step_s": found.step_s, **found._asdict()})
+        elif math.isinf(found.high_s):
+            log.warning("how long no program ran is known by this computer's clock alone, which may be wrong")
+        return found.s
 
 
 class Family:

@@ -29,6 +29,7 @@ from experiments.record.summary import (
     summarise,
 )
 from experiments.reporting import charts
+from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError
 
 __all__ = ["deploy"]
@@ -48,7 +49,7 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
     """Run the loop until its end or trouble; return the outcome. Pumps are verified off, whatever happens."""
     log_changes, marks, reactors = ChangeLog(loop, tell), BenchMarks(record), loop.reactors
     outcome = "failed: see the log"
-    record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
+    record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid(), "boot": boot()})
     try:
         with logging_redirect_tqdm(), tqdm(disable=None, unit="sample") as bar:
             for step in loop.run():

@@ -68,7 +68,7 @@ class ChiBioFamily(Family):
                 reactors = ChiBioReactors(
                     transport, clock, backend, calibrations, opening.journal.append, opening.bench
                 )
-            elapsed_s = opening.elapsed_s(backend.speed)
+            elapsed_s = opening.elapsed_s(backend.speed, *reactors.bounds_s(earlier))
             reactors.begin(replay(earlier), elapsed_s)
             with left_off(reactors):
                 yield reactors

@@ -6,7 +6,9 @@ an agenda that `measure` works through while it waits, so the doses of several r
 carried out even when other requests fail.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -16,7 +18,8 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.context import Context
 from hardware.chibio.dosing import ReactorCalibration
-from hardware.chibio.resume import ReactorHistory
+from hardware.chibio.protocol import CONTROL_S
+from hardware.chibio.resume import ReactorHistory, replay
 from hardware.chibio.station import Station
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, ReactorError
@@ -25,6 +28,8 @@ from hardware.logbook import Log, Logbook, no_log
 from hardware.stations import Stations
 
 __all__ = ["ChiBioReactors"]
+
+SLOWEST_S = 61.0  # a cycle of the device takes at most so long as a rule
 
 
 class ChiBioReactors(Stations[Station, ReactorHistory]):
@@ -60,6 +65,25 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         past = partial(self._past.__getitem__, name)
         volume_ml = self._bench.volume_of(name)
         return Station(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
+
+    def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+        """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
+
+        A cycle takes 60 s or a little more, whatever any clock is set to. An experiment that somebody stopped for a
+        while counts too few, one that died counts none: with no cycle at all there is no upper bound.
+        Args: rows: of the run's journal.
+        """
+        low_s, most_s = 0.0, list[float]()
+        newest = {row["reactor"]: row for row in rows if row["kind"] == "sample"}
+        began = {name: known.start_time for name, known in replay(rows).items()}
+        for station in self.stations:
+            with suppress(ReactorError, KeyError, TypeError, ValueError):
+                row, state = newest[station.name], station.connection.read()
+                begun, at_s = state.cycles - int(row["sample"][1]), float(row["time_s"])
+                if state.running and state.start_time == began[station.name]:
+                    low_s = max(low_s, at_s + CONTROL_S * (begun - 1))
+                    most_s.append(at_s + SLOWEST_S * (begun + 1) if begun > 0 else math.inf)
+        return low_s, max(most_s, default=math.inf)
 
     def _take_over(self, histories: Mapping[str, ReactorHistory]) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.

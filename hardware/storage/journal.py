@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from hardware.clock import uptime
 from hardware.errors import RecordingError
 from hardware.storage.atomic import sync_folder
 
@@ -18,9 +19,9 @@ TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
-    f'"kind":"{kind}"'.encode() for kind in ("device", "temperature", "regulate", "guard", "level", "share")
+    f'"kind":"{kind}"'.encode() for kind in ("device", "temperature", "regulate", "guard", "level", "share", "start")
 )
-"""Identities, blanks, thermostat targets, hand-overs, overflow pumps, levels and counted shares: valid for days."""
+"""Identities, blanks, targets, hand-overs, overflow pumps, levels, counted shares, starts: valid for days."""
 
 
 def _plain(value: Any) -> Any:
@@ -131,7 +132,7 @@ class Journal:
         """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
         if self._file is None:
             raise RecordingError(f"journal {self.path}: written to after it was closed")
-        row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(time.monotonic(), 3), "kind": kind}
+        row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(uptime(), 3), "kind": kind}
         line = json.dumps(_plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             written = os.write(self._file, line)

@@ -179,7 +179,7 @@ def test_the_cells_of_a_recording(tmp_path: Path) -> None:
 
 
 def test_the_head_of_a_journal_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("time.monotonic", lambda: 5.4321987)
+    monkeypatch.setattr("hardware.storage.journal.uptime", lambda: 5.4321987)
     journal = Journal(tmp_path / "j", wall=lambda: 1000.123456)
     journal.append("device", {"od": [np.nan, 0.5]})
     journal.close()
@@ -223,6 +223,7 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         assert [row["k"] for row in reader.rows] == kept
         assert (reader.cut, reader.next_row) == (len(torn), 12)
     assert all(
-        json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "guard", "level", "share")
+        json.loads(b"{" + mark + b"}")["kind"]
+        in ("device", "temperature", "regulate", "guard", "level", "share", "start")
         for mark in LANDMARKS
     )

@@ -180,7 +180,7 @@ def test_a_run_began_with_the_first_row_of_its_journal_however_often_it_was_resu
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows at 1000 s and, of a second life, at 5000 s; looked at again at 8000 s."""
-    monkeypatch.setattr("hardware.family.time.time", lambda: 8000.0)
+    monkeypatch.setattr("time.time", lambda: 8000.0)
     new = Journal(tmp_path / "j", fsync=False)
     assert Opening(None, Bench(), PlantConfig(), new, tmp_path, False).began == 8000.0
     assert Opening(None, Bench(), PlantConfig(), new, tmp_path, False).elapsed_s() == 0.0

@@ -248,6 +248,9 @@ class Begun:
     def __init__(self, *given: Any) -> None:
         self.given, self.began = given, list[tuple[Any, float]]()
 
+    def bounds_s(self, rows: Any) -> tuple[float, float]:
+        return 0.0, math.inf
+
     def begin(self, histories: Any, elapsed_s: float) -> None:
         self.began.append((histories, elapsed_s))
 
