@@ -8,19 +8,19 @@ know their user by it: it is only ever in the environment, and what is logged of
 import json
 import logging
 import os
-import queue
 import shlex
 import shutil
 import signal
 import subprocess
-import threading
 from collections.abc import MutableMapping, Sequence
 from contextlib import suppress
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from experiments.cli import frame
+from experiments.cli.outlet import Outlet
 
 __all__ = ["HOOK", "Hook", "Notifier", "hidden", "opened"]
 
@@ -119,51 +119,40 @@ class Notifier:
 
     def __init__(self, hook: Hook | None, run: Path) -> None:
         self._hook, self._run = hook, str(run)
-        self.sent = self.failed = self.dropped = 0
-        self._over = False
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING)
-        self._thread: threading.Thread | None = None
-        if hook is not None:
-            self._thread = threading.Thread(target=self._deliver, args=(hook,), name="notify", daemon=True)
-            self._thread.start()
+        self.sent = self.failed = 0
+        self._outlet = None if hook is None else Outlet(partial(self._send, hook), WAITING)
+
+    @property
+    def dropped(self) -> int:
+        """Messages that found no room."""
+        return 0 if self._outlet is None else self._outlet.dropped
 
     def __call__(self, event: str, text: str, reactor: str = "") -> None:
         """Queue a message. Args: event: start, alarm, hand_over, policy or end. reactor: "" for all."""
-        if self._thread is None:
+        if self._outlet is None:
             return
         at = datetime.now().astimezone().isoformat(timespec="seconds")
         message = {"event": event, "time": at, "run": self._run, "reactor": reactor, "text": text}
-        try:
-            self._waiting.put_nowait(json.dumps({k: v for k, v in message.items() if v}).encode() + b"\n")
-        except queue.Full:
-            self.dropped += 1
-            if self.dropped == 1:
-                log.warning("notify: messages are dropped, the hook does not keep up")
+        line = json.dumps({k: v for k, v in message.items() if v}).encode() + b"\n"
+        if not self._outlet.put(line) and self.dropped == 1:
+            log.warning("notify: messages are dropped, the hook does not keep up")
 
-    def _deliver(self, hook: Hook) -> None:
-        while (line := self._waiting.get()) is not None and not self._over:
-            if problem := hook.send(line):
-                self.failed += 1
-                if self.failed == 1:
-                    log.warning("notify: %s did not take a message (%s); the run goes on", hook.name, problem)
-            else:
-                self.sent += 1
+    def _send(self, hook: Hook, line: bytes) -> None:
+        problem = hook.send(line)
+        self.sent, self.failed = self.sent + (not problem), self.failed + bool(problem)
+        if problem and self.failed == 1:
+            log.warning("notify: %s did not take a message (%s); the run goes on", hook.name, problem)
 
     def close(self) -> None:
         """Wait a few seconds for what is still queued, then give it up; say how many messages arrived. Idempotent."""
-        if self._thread is None or self._hook is None:
+        if self._outlet is None or self._hook is None:
             return
-        with suppress(queue.Full):
-            self._waiting.put_nowait(None)
-        self._thread.join(LAST_S)
-        if self._thread.is_alive():
-            self._over = True
-            self._hook.give_up()
-        left = self._waiting.qsize()
-        self._thread = None
+        left, dropped = self._outlet.close(LAST_S), self.dropped
+        self._hook.give_up()
+        self._outlet = None
         log.info(
             "notify: %s took %d messages; %d failed, %d were dropped, %d were left at the end",
-            self._hook.name, self.sent, self.failed, self.dropped, left,
+            self._hook.name, self.sent, self.failed, dropped, left,
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from experiments.cli import files, frame
+from experiments.cli import files, frame, outlet
 from experiments.cli.frame import swept
 from experiments.cli.stop import heard, one_interrupt
 from experiments.control import assemble, notify
@@ -114,6 +114,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
+    outlet.detach()
     if (whole := assemble.completed(assemble.with_pair(config, folder))) != config:
         config = whole
         frame.save_config(config, folder)

@@ -1,0 +1,101 @@
+"""What goes out to whoever may not take it: it waits in a bounded queue for a thread of its own, nobody else waits."""
+
+import atexit
+import logging
+import os
+import queue
+import stat
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Generic, TextIO, TypeVar
+
+__all__ = ["Outlet", "Screen", "detach"]
+
+T = TypeVar("T")
+LAST_S, WAITING = 2.0, 2000  # for what is left at the end of a program; pieces of output that may wait
+
+
+class Outlet(Generic[T]):
+    """A queue of at most `size` things, and a thread that sends them in turn. Putting one in never waits nor raises.
+
+    Attributes: dropped: how many found no room.
+    """
+
+    def __init__(self, send: Callable[[T], None], size: int) -> None:
+        self._send, self._size, self._over, self.dropped = send, size, False, 0
+        self._waiting: queue.SimpleQueue[T | None] = queue.SimpleQueue()  # a signal's handler may put into it as well
+        self._thread = threading.Thread(target=self._deliver, daemon=True)
+        self._thread.start()
+
+    def put(self, one: T) -> bool:
+        """Queue one; whether there was room."""
+        if room := self._waiting.qsize() < self._size:
+            self._waiting.put(one)
+        self.dropped += not room
+        return room
+
+    def _deliver(self) -> None:
+        while (one := self._waiting.get()) is not None and not self._over:
+            with suppress(OSError):  # nobody will ever read it
+                self._send(one)
+
+    def close(self, within_s: float) -> int:
+        """Wait so long for what is queued, then give it up; how many were left."""
+        self._waiting.put(None)
+        self._thread.join(within_s)
+        self._over = self._thread.is_alive()
+        return max(self._waiting.qsize() - 1, 0)
+
+
+class Screen:
+    """A standard stream whose reader nobody waits for; what is dropped is counted, and told once there is room."""
+
+    def __init__(self, stream: TextIO, size: int = WAITING) -> None:
+        self._stream, self._number, self._lines = stream, stream.fileno(), 0
+        self.outlet = Outlet(self._out, size)
+
+    def write(self, text: str) -> int:
+        """Queue it."""
+        told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n" if self._lines else ""
+        room = self.outlet.put((told + text).encode(self._stream.encoding, "replace"))
+        self._lines = 0 if room else self._lines + text.count("\n")
+        return len(text)
+
+    def _out(self, left: bytes) -> None:
+        while left:
+            left = left[os.write(self._number, left) :]
+
+    def close(self) -> None:
+        """Tell what is missing, and wait a little for all of it."""
+        self.write("")
+        self.outlet.close(LAST_S)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _may_wait(stream: TextIO) -> bool:
+    """Whether its reader can make a writer wait: a terminal, which Ctrl-S stops, a pipe or a socket."""
+    try:
+        mode = os.fstat(stream.fileno()).st_mode
+    except (AttributeError, OSError, ValueError):
+        return False
+    return not isinstance(stream, Screen) and (stream.isatty() or stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode))
+
+
+def detach() -> None:
+    """From now on and until the program ends nobody waits for a reader of its screen. Idempotent."""
+    for name in ("stdout", "stderr"):
+        before = getattr(sys, name)
+        if not _may_wait(before):
+            continue
+        setattr(sys, name, after := Screen(before))
+        atexit.register(after.close)
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.StreamHandler) and handler.stream is before:
+                handler.stream = after
