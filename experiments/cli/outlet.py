@@ -58,8 +58,8 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Queue it."""
-        told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n" if self._lines else ""
-        room = self.outlet.put((told + text).encode(self._stream.encoding, "replace"))
+        told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n"
+        room = self.outlet.put((told * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
         self._lines = 0 if room else self._lines + text.count("\n")
         return len(text)
 

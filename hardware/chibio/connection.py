@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from hardware.chibio.protocol import PUMPS, DeviceState, Permitted, check_command, parse_state
+from hardware.chibio.protocol import PUMPS, WASTE, DeviceState, Permitted, check_command, parse_state
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import SharedLink, Transport
@@ -17,6 +17,8 @@ Later the next command looks first, because a server that starts carries out wha
 reactor that is absent by then."""
 SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
+DRAIN = 0.25
+"""Duty of a waste pump that runs beside a feed pump which may run: what the app clears its tube with."""
 
 
 def identity(transport: Transport, clock: Clock, where: str) -> str:
@@ -179,26 +181,32 @@ class Connection:
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
         """These pumps off, verified. Each one is tried even if another one fails, unless nothing answers at all.
 
+        The waste pump goes off last, after every feed pump was heard to: where one may run, it runs too.
+
         Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
         So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
         server's worker, whose end switches everything off: the remote kill switch (docs/device.md, Failures).
 
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """
-        error: ReactorError | None = None
         for attempt in range(tries):
             if attempt:
                 self.clock.sleep(1.0)
-            error = None
             if self.state is None:
                 self.read()  # presence first
-            silent = 0  # time-outs are long: after two in a row, fail instead of trying the other pumps
-            for pump in pumps:
+            error: ReactorError | None = None
+            refused: ProtocolError | None = None
+            silent = 0  # time-outs are long: after two in a row, fail instead of trying the others
+            for pump in sorted(pumps, key=WASTE.__eq__):
+                if pump == WASTE and (error or refused):
+                    break  # a feed pump may run
                 try:
                     self.switch(pump, False)
                     silent = 0
-                except (LinkError, ProtocolError) as failed:
-                    error, silent = failed, silent + isinstance(failed, LinkError)
+                except ProtocolError as failed:
+                    refused = failed
+                except LinkError as failed:
+                    error, silent = failed, silent + 1
                     if silent == 2:
                         break
             if error is not None:
@@ -206,15 +214,26 @@ class Connection:
             self.clock.sleep(SETTLE_S)
             try:
                 self.probe()
-                on = [p for p in self.read().running_pumps if p in pumps]
+                state = self.read()
+                on = [p for p in state.running_pumps if p in pumps]
+                if not on:
+                    return
+                if set(on) - {WASTE} and WASTE not in state.running_pumps:
+                    self._drain(state)
             except (LinkError, ProtocolError) as failed:
                 error = failed
                 continue
-            if not on:
-                return
-            error = DeviceStateError(f"{self.name}: {', '.join(on)} still on after the off command")
+            why = f" ({refused})" if refused else ""
+            named = ", ".join(pump for pump in on if pump != WASTE or on == [WASTE])
+            error = DeviceStateError(f"{self.name}: {named} still on after the off command{why}")
         assert error is not None
         raise error
+
+    def _drain(self, state: DeviceState) -> None:
+        """Waste pump on, as long as a feed pump may run. Raises: as `post`."""
+        if not state.pump_targets[PUMPS.index(WASTE)] >= DRAIN:  # also nan
+            self.target(WASTE, DRAIN)
+        self.switch(WASTE, True)
 
     def probe(self) -> None:
         """Touch the bus with a blocking call. Raises: LinkError if it hangs."""

@@ -19,7 +19,8 @@ __all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
-LATE_S = 300.0  # a command that was given up may wait so long in a queue or on the way, and is carried out then
+LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then
+REFUSALS = 4  # of pumps that should be off, in a row, until the experiment is ended
 SLOW_S = 1.0  # an answer to a pump command that takes longer is told
 
 
@@ -209,7 +210,8 @@ class DoseSequence:
 
     def _finish(self) -> Task:
         """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
-        for refusals in range(10**9):
+        refusals = 0
+        while True:
             try:
                 self.settle()
                 return
@@ -217,8 +219,8 @@ class DoseSequence:
                 self._book.report(fault_of(error, present=True))
             except DeviceStateError as error:
                 if self._connection.state is not None:
-                    self.stuck = str(error)
-                    if refusals == 3:
+                    self.stuck, refusals = str(error), refusals + 1
+                    if refusals == REFUSALS:
                         self.escalated = True
                         self._connection.escalate()
             yield self._pause_s()

@@ -18,7 +18,6 @@ __all__ = ["conclude", "found"]
 
 SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last request that it heard is not on record
 MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer
-SILENT_S = 20.0  # a request without an answer was carried out within that, if at all
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,8 @@ def found(
 
     None takes back what was answered and is not so. Nothing is added where the answers have told it. A pump that is
     found off was switched off by whom and when, in this order: by a restart; by the agent, as it says; by a command of
-    ours whose answer was lost; else it never went on, or an agent without a record switched it off after our silence.
+    ours whose answer was lost, done at once or when a tunnel delivered it; by the end of its experiment; else it never
+    went on, or an agent without a record switched it off after our silence.
 
     Args:
       state: as read at run time now_s. seen_s: run time of the last answer before that.
@@ -78,7 +78,8 @@ def found(
         agent_s = (stopped or {}).get(pump.name, math.nan)
         silent = stopped is None and now_s >= seen_s + silence_s
         if (is_on or not math.isnan(agent_s)) and not on_heard:
-            added[f"{pump.part}_on"] = (asked_s, min(asked_s + SILENT_S, now_s))
+            heard_s = now_s if is_on else agent_s - silence_s + SWITCH_S  # an agent waits from the last request on
+            added[f"{pump.part}_on"] = (asked_s, min(max(asked_s, heard_s), now_s))
         if is_on and (off_heard or not math.isnan(pump.tried_s)):
             added[f"{pump.part}_off"] = None
         if is_on or off_heard:
@@ -88,7 +89,9 @@ def found(
         elif not math.isnan(agent_s):
             off = agent_s, agent_s
         elif not math.isnan(pump.tried_s) and not silent:
-            off = pump.tried_s, pump.tried_s
+            off = min(pump.tried_s, now_s), now_s
+        elif not state.running:
+            off = min(seen_s, now_s), now_s
         elif on_heard and pump.part == "feed" and state.pumps_on[PUMPS.index(WASTE)]:  # an agent ends both
             off = pump.on[1] + pump.dose_s + MOTOR_S, pump.on[1] + pump.dose_s + MOTOR_S
         elif not on_heard and not silent:

@@ -17,6 +17,7 @@ from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.context import Context
+from hardware.chibio.dose_sequence import REFUSALS
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay
@@ -152,9 +153,12 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         def failed(pending: Sequence[Station]) -> dict[Station, ReactorError]:
             return self._all(pending, lambda station: station.doses.settle(overflow_pump=True))
 
-        deadline = self._clock.now() + self.config.stop_s
+        deadline, tries = self._clock.now() + self.config.stop_s, 1
         pending = failed(stations)
         while pending and self._clock.now() < deadline:
+            if (tries := tries + 1) == REFUSALS:  # who answers and does not obey will not later either
+                for station in (one for one, error in pending.items() if isinstance(error, DeviceStateError)):
+                    station.connection.escalate()
             self._clock.sleep(min(self.config.retry_s, 2.0))
             pending = failed(list(pending))
         self._agenda.clear()

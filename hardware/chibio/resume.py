@@ -61,25 +61,29 @@ class ReactorHistory(History):
                 waste_tried=math.nan,
             )  # fmt: skip
         if kind == "command" and known.open:
-            heard, took_s = row["answer"] == 204, float(row.get("took_s") or 0.0)
-            return known._switched(str(row["path"]), heard, float(row["time_s"]), took_s)
+            return known._switched(
+                str(row["path"]), row["answer"], float(row["time_s"]), float(row.get("took_s") or 0.0)
+            )
         if kind == "found":
             said = {key: _span(row[key]) for key in SPANS & row.keys()}
-            over = {f"{part}_tried": math.nan for part in ("feed", "waste") if f"{part}_off" in said}
+            seen_s = float(row.get("time_s", math.nan))  # still on, although it was asked off: it goes off after that
+            over = {
+                f"{key[:-4]}_tried": seen_s if at is NEVER else math.nan for key, at in said.items() if "off" in key
+            }
             return replace(known, wasted=known.wasted or "waste_on" in said, **said, **over)  # type: ignore[arg-type]
         return replace(known, overflow_pump_on=True) if kind == "guard" else known
 
-    def _switched(self, path: str, heard: bool, at_s: float, took_s: float) -> Self:
-        """A pump was switched in an open dose; the first answer of its kind counts."""
+    def _switched(self, path: str, answer: int | str, at_s: float, took_s: float) -> Self:
+        """A pump was switched in an open dose; the first answer of its kind counts, a refusal does not."""
         known = replace(self, wasted=self.wasted or path.startswith(f"/SetOutputOn/{WASTE}/1/"))
         for part, pump in (("feed", known.feed_pump), ("waste", WASTE)):
             for force, word in ((1, "on"), (0, "off")):
                 key = f"{part}_{word}"
                 if not path.startswith(f"/SetOutputOn/{pump}/{force}/") or not math.isnan(getattr(known, key)[1]):
                     continue
-                if heard:
+                if answer == 204:
                     return replace(known, **{key: (at_s - took_s, at_s)})  # type: ignore[arg-type]
-                if word == "off" and math.isnan(getattr(known, f"{part}_tried")):
+                if word == "off" and isinstance(answer, str) and math.isnan(getattr(known, f"{part}_tried")):
                     return replace(known, **{f"{part}_tried": at_s - took_s})  # type: ignore[arg-type]
         return known
 

@@ -22,7 +22,7 @@ from hardware.link.transport import Reply, Transport
 from hardware.logbook import Logbook
 from tests.hardware.script import DONE, answer, state
 
-OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)]
+OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 3, 4, 2)]
 END = [*OFFS, "/MeasureTemp/IR/M0", "/changeDevice/M0"]
 FEED_ON, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump2/1/M0"
 FEED_DUTY = 0.009523  # 0.6 mL at 1 mL/s in 63 s, cut to six places
@@ -337,7 +337,7 @@ def test_a_feed_pump_that_was_heard_to_be_off_repeats_nothing_while_the_waste_go
 @pytest.mark.parametrize(
     ("shown", "until_then", "times"),
     [
-        ({}, {"Pump1__ON": 1}, (2, 0)),  # the feed pump answers off and goes on; the waste pump took its off
+        ({}, {"Pump1__ON": 1}, (2, 2)),  # the feed pump answers off and goes on; the waste pump goes on beside it
         ({"Experiment__startTime": "2026-01-01 01:00:00"}, {"Pump1__ON": 1}, (0, 0)),  # restarted in the dose
     ],
 )

@@ -111,19 +111,21 @@ def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
         (OPEN, read(False, False), 1500.0, 95.9, None, 2.4, 0.0),  # until 225.9 s
         # its command was not answered, and no agent can have acted yet: found off, it never went on
         (UNHEARD, read(False, True), 219.0, 100.0, {}, 0.0, 0.0),
-        (UNHEARD, read(True, True), 130.0, 100.0, {}, 1.2, 1.2),
+        (UNHEARD, read(True, True), 130.0, 100.0, {}, 1.2, 0.0),  # a tunnel may have kept it until just now
         (UNHEARD, read(False, False), 219.9, 100.0, None, 0.0, 0.0),
         (UNHEARD, read(False, False), 220.1, 100.0, None, 2.4, 0.0),
         (UNHEARD, read(False, False), 900.0, 100.0, {}, 0.0, 0.0),
         # heard and found off: somebody switched it off, nobody knows when; the agent would have ended both pumps
         (OPEN, read(False, False), 130.0, 101.0, {}, 1.2, 0.0),
         (OPEN, read(False, True), 130.0, 101.0, {}, 1.2, 1.2),
-        # asked off without an answer, and found off
-        (replace(OPEN, feed_tried=103.5, waste_tried=111.0), read(False, False), 600.0, 101.0, {}, 1.2, 1.2),
-        (replace(OPEN, feed_tried=166.0), read(False, False), 600.0, 101.0, {}, 2.4, 2.4),
+        # asked off without an answer, and found off: done at once, or when a tunnel delivered it just now
+        (replace(OPEN, feed_tried=103.5, waste_tried=111.0), read(False, False), 600.0, 101.0, {}, 9.6, 1.2),
+        (replace(OPEN, feed_tried=166.0), read(False, False), 600.0, 101.0, {}, 9.6, 2.4),
         (replace(OPEN, feed_tried=103.5), read(False, False), 600.0, 101.0, {"Pump1": 222.5}, 2.4, 2.4),
         (replace(OPEN, feed_tried=103.5), read(False, False), 600.0, 101.0, None, 3.6, 0.0),
-        (replace(UNHEARD, feed_tried=123.3), read(False, False), 600.0, 101.0, {}, 1.2, 0.0),
+        (replace(UNHEARD, feed_tried=123.3), read(False, False), 600.0, 101.0, {}, 9.6, 0.0),
+        # refused, and its experiment was ended for that
+        (OPEN, read(False, False, running=False), 130.0, 120.0, {}, 1.2, 1.2),
         (replace(OPEN, feed_tried=103.5), read(True, False), 240.0, 101.0, {}, 3.6, 3.6),
         # never fed
         (UNFED, read(False, True), 1000.0, 98.0, {}, 0.0, 0.0),
