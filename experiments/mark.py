@@ -81,7 +81,7 @@ def _minute_now(folder: Path, stored: Any) -> float:
 
 
 def _latest(folder: Path, stored: Any) -> float:
-    """The minute up to which a run has come."""
+    """Return the minute up to which a run has come."""
     try:
         return _minute_now(folder, stored)
     except frame.UserError:
@@ -122,7 +122,7 @@ def _body(config: MarkConfig, folder: Path) -> None:
 
 
 def _quoted(argument: str) -> str:
-    """A text as it was typed, whatever Hydra's grammar would make of it."""
+    """Return a text as it was typed, whatever Hydra's grammar would make of it."""
     key, _, value = argument.partition("=")
     if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
         return argument

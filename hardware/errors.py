@@ -4,15 +4,9 @@ Every message names the thing, its value with unit, the allowed range and the re
 """
 
 __all__ = [
-    "DeviceStateError",
-    "IdentityError",
-    "LinkError",
-    "ProtocolError",
-    "ReactorError",
-    "RecordingError",
-    "SensorError",
-    "UnfitError",
-]
+    "DeviceStateError", "IdentityError", "LinkError", "ProtocolError", "ReactorError", "RecordingError",
+    "SensorError", "UnfitError",
+]  # fmt: skip
 
 
 class ReactorError(Exception):

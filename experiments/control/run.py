@@ -3,7 +3,7 @@
 import logging
 import os
 import shlex
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 from tqdm import tqdm
@@ -80,9 +80,10 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
 def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
     folder = record.folder
-    if not outcome.startswith(("completed", "stopped by the interlock")):
-        with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
-            record.complete()
+    try:  # a signal or an error in a dose ends the loop before its row is written; the last dose may be repeated
+        record.complete()
+    except (RecordingError, OSError) as error:
+        log.warning("%s", error)
     try:
         title = f"{setup.title}: {outcome}"
         table = record.table()

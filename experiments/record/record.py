@@ -18,7 +18,7 @@ import numpy as np
 from experiments.cli import files
 from experiments.loop.loop import Step
 from experiments.record.curves import Curves
-from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, Rows, complete, cut_short, read_rows, row_of
+from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, Rows, at_end, complete, read_rows, row_of
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
 from hardware.storage.marks import Mark, read_marks
@@ -65,19 +65,26 @@ class Record:
         self._fsync = fsync
         (folder / "recordings").mkdir(exist_ok=True)
         self.journal = Journal(folder / "journal.jsonl", fsync=fsync)
+        try:
+            self._continue(columns)
+        except BaseException:
+            self.journal.close()
+            raise
+
+    def _continue(self, columns: Sequence[str]) -> None:
         self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
-        paths = [folder / "recordings" / f"{name}.csv" for name in names]
-        self._recorders = [Recorder(path, columns, fsync, REBUILD) for path in paths]
+        paths = [self.folder / "recordings" / f"{name}.csv" for name in self.names]
+        self._recorders = [Recorder(path, columns, self._fsync, REBUILD) for path in paths]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
         self._paths, self.columns = paths, tuple(columns)
         self.rows = [read_rows(path, columns) for path in paths]
         self.repairs += self._completed(self.journal.rows)
         began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
         newest = max((float(rows.columns["time_min"][-1]) for rows in self.rows if len(rows)), default=-1.0)
-        self.curves = Curves(folder, self.names, "ratio" in columns, round(newest) + 1, began)
+        self.curves = Curves(self.folder, self.names, "ratio" in columns, round(newest) + 1, began)
 
     def complete(self) -> None:
-        """Write what the end of the loop kept from being written, as the journal has it: rows, and a dose cut short.
+        """Write what the end of the loop kept from being written, as the journal has it: rows, and what doses came to.
 
         What was written is read from the disk, because a signal may have come between a row and the memory of it.
         Raises: RecordingError.
@@ -85,7 +92,11 @@ class Record:
         self.rows, journal = [read_rows(path, self.columns) for path in self._paths], self.journal.reread()
         self._completed(journal)
         for n, name in enumerate(self.names):
-            if row := cut_short(journal, name, self.rows[n]):
+            closed = {"n": self.journal.next_row, "kind": "closed", "reactor": name}
+            if any(row["kind"] == "intent" for row in journal) and (
+                row := at_end([*journal, closed], name, self.rows[n])
+            ):
+                self.journal.append("closed", {"reactor": name})
                 self._recorders[n].amend(row)
                 self.rows[n] = read_rows(self._paths[n], self.columns)
 

@@ -26,7 +26,7 @@ from hardware.storage.doses import dosed
 from hardware.storage.journal import REMEDY, Journal
 
 __all__ = [
-    "COLUMNS", "REBUILD", "Row", "complete", "continue_loop", "cut_short", "load_state", "read_rows", "row_of",
+    "COLUMNS", "REBUILD", "Row", "at_end", "complete", "continue_loop", "load_state", "read_rows", "row_of",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
@@ -39,6 +39,7 @@ COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
 )  # fmt: skip
+KEPT = ("decision", "closed")  # rows of the journal that say what is in a row of a recording
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -106,7 +107,11 @@ class Rows:
 def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
     """The rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
     found = Rows(columns)
-    with open(path, newline="", encoding="utf-8") as f:
+    try:
+        file = open(path, newline="", encoding="utf-8")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; {REBUILD}") from None
+    with file as f:
         rows = csv.DictReader(f)
         try:
             for raw in rows:
@@ -138,27 +143,31 @@ def complete(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write:
 def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
     """mL that belong to each decision for a reactor, by its row of the journal, oldest first.
 
-    A dose belongs to the decision before it, its repetitions to the next one. Raises: RecordingError.
+    A dose belongs to the decision before it, its repetitions to the next one, or at the end of a life of the run to the
+    last one (`closed`). Raises: RecordingError.
     """
-    decided = [r["n"] for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
+    decided, closed = ([r["n"] for r in journal if r.get("reactor") == name and r["kind"] == k] for k in KEPT)
     found = dict.fromkeys(decided, 0.0)
     for dose in dosed(journal):
-        k = bisect.bisect(decided, dose.n) - (not dose.again)
+        k = bisect.bisect(decided, dose.n)
+        ended = bisect.bisect(closed, dose.n) < bisect.bisect(closed, decided[k] if k < len(decided) else math.inf)
+        k -= not dose.again or ended
         if dose.reactor == name and 0 <= k < len(decided):
             found[decided[k]] += dose.feed_ml
     return found
 
 
-def cut_short(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
-    """The last row of reactor `name` as it should be, if the end of the run cut its dose short; else None.
+def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
+    """The last row of reactor `name` as it should be, if its dose was cut short or repeated after it; else None.
 
-    Args: rows: as written, with the dose as it was planned. Raises: RecordingError.
+    Args: journal: up to the end of this life of the run, with a row `closed`. rows: as written, with the dose as it was
+      planned. Raises: RecordingError.
     """
     decisions = [r for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
     if not decisions or not len(rows) or rows.last()["time_min"] != decisions[-1]["row"]["time_min"]:
         return None
     given = volumes(journal, name)[decisions[-1]["n"]]
-    if given >= rows.last()["volume_ml"] - 1e-6:
+    if abs(given - rows.last()["volume_ml"]) <= 1e-6:
         return None
     return {c: _kept(decisions[-1]["row"], c) for c in rows.names} | {"volume_ml": given}
 
@@ -244,7 +253,9 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
     except ValueError as error:
         raise _no_state(path, str(error)) from None
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
-    decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
+    decided, written = (
+        {r["reactor"]: r["n"] for r in journal.rows if r["kind"] in kinds} for kinds in (KEPT[:1], KEPT)
+    )
     marked = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]
     for dose in [*doses, None]:
         while marked and (dose is None or marked[0]["n"] < dose.n):
@@ -257,7 +268,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
         if dose.n > decided.get(dose.reactor, -1):  # what came before the newest decision is in its position already
             loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
-        if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
+        if dose.again and dose.n > written.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
     before = [row for row in journal.rows if row["n"] < state["journal_row"]]
     kept_ml = _put_off(journal.rows, loop) - _put_off(before, loop)

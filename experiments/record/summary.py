@@ -43,6 +43,7 @@ FORMATS = {  # of the metrics of a window
     "steady_abs_error": "8.4f",
 }
 AGAIN_S = 3600.0
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 class ChangeLog:
@@ -58,7 +59,7 @@ class ChangeLog:
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
-        self._noted: dict[str, float] = {}  # run time at which a kind of note was last said
+        self._noted: dict[str, tuple[float, float]] = {}  # when a kind of note was last said, its largest number then
         self._error, self._samples = np.zeros(len(self._names)), np.zeros(len(self._names))  # of the window so far
 
     def __call__(self, step: Step) -> None:
@@ -93,10 +94,15 @@ class ChangeLog:
         for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
             self._tell("hand_over", "the device regulates by itself from now on", self._names[n])
         self._handed_over = self._reactors.handed_over.copy()
-        for note in step.notes:
-            kind = re.sub(r"[\d.]+", "#", note)
-            if step.now_s >= self._noted.get(kind, -np.inf) + AGAIN_S:
-                self._noted[kind] = step.now_s
+        self.notes(step.now_s, step.notes)
+
+    def notes(self, now_s: float, notes: Sequence[str]) -> None:
+        """Log notes. Their numbers may vary, names of reactors and pumps not; what has doubled is told again."""
+        for note in notes:
+            kind, largest = NUMBER.sub("#", note), max(map(float, NUMBER.findall(note)), default=0.0)
+            told_s, before = self._noted.get(kind, (-np.inf, 0.0))
+            if now_s >= told_s + AGAIN_S or largest >= 2.0 * before > 0.0:
+                self._noted[kind] = now_s, largest
                 log.info("%s (noted here once an hour, every time in the journal)", note)
 
     def _ended(self, step: Step, n: int) -> str:

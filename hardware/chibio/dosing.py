@@ -13,15 +13,9 @@ from conf.schema import check, require, setting
 from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
 
 __all__ = [
-    "DosePlan",
-    "DosingConfig",
-    "PumpCalibration",
-    "PumpFit",
-    "ReactorCalibration",
-    "SupplyConfig",
-    "fit_pump",
+    "DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCalibration", "SupplyConfig", "fit_pump",
     "plan_dose",
-]
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

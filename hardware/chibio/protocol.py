@@ -13,23 +13,8 @@ from typing import Any
 from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
-    "BANDS",
-    "CONTROL_S",
-    "FEED",
-    "LEAST_ML",
-    "LEDS",
-    "MAX_OVERFLOW_DUTY",
-    "PERIOD_S",
-    "POSITIONS",
-    "PUMPS",
-    "SLOTS",
-    "SPARE",
-    "UNSET_BLANK",
-    "WASTE",
-    "DeviceState",
-    "Slot",
-    "check_command",
-    "parse_state",
+    "BANDS", "CONTROL_S", "FEED", "LEAST_ML", "LEDS", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS",
+    "SLOTS", "SPARE", "UNSET_BLANK", "WASTE", "DeviceState", "Slot", "check_command", "parse_state",
 ]  # fmt: skip
 
 POSITIONS = tuple(f"M{k}" for k in range(8))

@@ -1,5 +1,6 @@
 """Append-only journal of a run: JSON lines, each on disk before the call returns, a torn last line cut on reopening."""
 
+import fcntl
 import json
 import math
 import os
@@ -100,25 +101,29 @@ class Journal:
     Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
       file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, doses left open, and the last 20 MB;
       next_row, the number the next row will have.
-    Raises: RecordingError if the file cannot be opened, read or written; the message says what to do.
+    Raises: RecordingError if the file cannot be opened, read or written, or another program writes to it.
     """
 
     def __init__(self, path: Path, wall: Callable[[], float] = time.time, fsync: bool = True) -> None:
         self.path, self._wall, self._fsync = path, wall, fsync
+        self._file: int | None = None
         try:
-            size = path.stat().st_size if path.exists() else 0
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            size = os.fstat(self._file).st_size
             before = max(size - TAIL, 0)
             old = _tail(path, before) if size else b""
             before = size - len(old)
             kept = before + _complete(old)
             self.cut = size - kept
-            self._file: int | None = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             if self.cut:
                 os.ftruncate(self._file, kept)
             os.fsync(self._file)
             sync_folder(path.parent)
         except OSError as error:
-            raise RecordingError(f"journal {path}: {error.strerror or error}; check folder, rights and disk") from error
+            self.close()
+            why = "the run is under way in another program" if isinstance(error, BlockingIOError) else error.strerror
+            raise RecordingError(f"journal {path}: {why or error}; check folder, rights and disk") from error
         try:
             self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
             _check(self.rows, path)

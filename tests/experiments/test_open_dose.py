@@ -225,8 +225,8 @@ def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Pa
     run.clock.sleep(0.6)
     run.reactors.stop()
     run.record.complete()
-    given = run.record.journal.reread()[-2]
-    assert (given["kind"], given["feed_times"]) == ("dose_end", 0)
+    given = [row for row in run.record.journal.reread() if row["kind"] == "dose_end"][-1]
+    assert given["feed_times"] == 0
     assert given["feed_ml"] == pytest.approx(0.66, abs=0.02)  # 0.6 s and the bias of 0.06 s at 1 mL/s
     volume = run.record.series("volume_ml")[0]
     np.testing.assert_allclose(volume, [*[step.volume_ml[0] for step in steps[:-1]], given["feed_ml"]])
