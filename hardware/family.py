@@ -246,12 +246,9 @@ def not_looked_at() -> Iterator[None]:
 
 
 SHIPPED: Mapping[str, str] = {
-    "sim": "hardware.simulated",
-    "chibio": "hardware.chibio.family",
-    "emulator": "hardware.emulator.family",
-    "pioreactor": "hardware.pioreactor.family",
-    "pioreactor_rig": "hardware.rig.family",
-}
+    "sim": "hardware.simulated", "chibio": "hardware.chibio.family", "emulator": "hardware.emulator.family",
+    "pioreactor": "hardware.pioreactor.family", "pioreactor_rig": "hardware.rig.family",
+}  # fmt: skip
 """The module of each kind that comes with the program; its FAMILY is the object."""
 _loaded: dict[str, Family] = {}
 

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 __all__ = ["Remembers", "Words", "restore", "restore_rows", "row", "rows", "save", "words"]
 
 KINDS: dict[str, tuple[set[type], str]] = {
-    "b": ({bool}, "true or false"),
-    "i": ({int}, "numbers"),
-    "f": ({int, float, NoneType}, "numbers"),
-}
+    "b": ({bool}, "true or false"), "i": ({int}, "numbers"), "f": ({int, float, NoneType}, "numbers"),
+}  # fmt: skip
 
 
 @runtime_checkable

@@ -164,14 +164,9 @@ class Opinion:
 
 
 def judged(
-    policy: Policy,
-    settings: Mapping[str, Any],
-    file: Path,
-    setpoints: Sequence[float],
-    bench: Bench,
-    model: EnvConfig,
+    policy: Policy, settings: Mapping[str, Any], file: Path, setpoints: Sequence[float], bench: Bench, model: EnvConfig,
     name: str,
-) -> Opinion:
+) -> Opinion:  # fmt: skip
     """Judge a policy by its certificate: refuse for safety, tell what its performance lacks.
 
     It is proven anew for the setpoints and the bench of the run: another bench is no reason by itself.

@@ -165,14 +165,9 @@ class ShareTrial(Trial):
 
 
 def run_trial(
-    cell: Cell,
-    plant_config: PlantConfig,
-    schedule: Scenario,
-    make: Callable[[Plant], Controller],
-    model: EnvConfig,
-    replicates: int,
-    seed: int,
-) -> DensityTrial:
+    cell: Cell, plant_config: PlantConfig, schedule: Scenario, make: Callable[[Plant], Controller], model: EnvConfig,
+    replicates: int, seed: int,
+) -> DensityTrial:  # fmt: skip
     """Run N replicates, which are named M0, M1, ..., as one batch.
 
     The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
@@ -261,30 +256,18 @@ def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Sh
     if cell.calibrated:
         calibrate(estimator, plant, config.seed)
     found = run_share(
-        plant,
-        estimator,
-        law,
-        _beside(config, cell.density),
-        program,
-        np.asarray(scenario.setpoints),
-        np.asarray(scenario.temperatures),
-        scenario.announce_min if cell.announced else 0.0,
-    )
+        plant, estimator, law, _beside(config, cell.density), program, np.asarray(scenario.setpoints),
+        np.asarray(scenario.temperatures), scenario.announce_min if cell.announced else 0.0,
+    )  # fmt: skip
     foresight = cell.announced and kind in registry.FORESIGHT
     minute = np.arange(found["share"].shape[1], dtype=np.float64)
     return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
 
 
 def run_share(
-    plant: Plant,
-    estimator: CompositionEstimator,
-    law: Acts,
-    density: Controller,
-    program: Program,
-    setpoints: Array,
-    temperatures: Array,
-    announce_min: float,
-) -> dict[str, Array]:
+    plant: Plant, estimator: CompositionEstimator, law: Acts, density: Controller, program: Program, setpoints: Array,
+    temperatures: Array, announce_min: float,
+) -> dict[str, Array]:  # fmt: skip
     """Read, decide and dose once a minute to the end of the program: the fields of a `ShareTrial` that are (N, K).
 
     There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors

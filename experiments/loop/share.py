@@ -98,13 +98,9 @@ class Share:
     remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(
-        self,
-        estimator: ShareEstimator,
-        law: Law,
-        schedules: Sequence[Scenario],
-        warnings: ShareWarnings | None = None,
+        self, estimator: ShareEstimator, law: Law, schedules: Sequence[Scenario], warnings: ShareWarnings | None = None,
         simulated: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.estimator, self.law, self.controller = estimator, law, Decider(estimator, law)
         self.schedules, self.warnings, self.simulated = schedules, warnings or ShareWarnings(), simulated
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)

@@ -23,14 +23,8 @@ from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 
 __all__ = [
-    "ChangeLog",
-    "composition_figure_of",
-    "figure_of",
-    "metrics_table",
-    "reasons_line",
-    "shares_table",
-    "summarise",
-]
+    "ChangeLog", "composition_figure_of", "figure_of", "metrics_table", "reasons_line", "shares_table", "summarise",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
 

@@ -36,11 +36,8 @@ def diagnose(
     if not state.running:
         return Fault("stopped", "the experiment was stopped by someone", "start it in the device's web page")
     if not abs(state.blank - blank) <= 0.5:  # also nan
-        return Fault(
-            "blank",
-            f"the blank was changed from {blank:.1f} to {state.blank:.1f}",
-            f"set it back (raw {blank:.1f}, OD 0) or start a new run",
-        )
+        changed = f"the blank was changed from {blank:.1f} to {state.blank:.1f}"
+        return Fault("blank", changed, f"set it back (raw {blank:.1f}, OD 0) or start a new run")
     if stuck:
         return Fault("pump", stuck, "switch the pump board off by hand")
     handed_over = math.isfinite(setpoint)
@@ -53,11 +50,10 @@ def diagnose(
         what = ", ".join(state.pumping_modes) or describe(state)
         return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
     if age_s > config.stale_s:
-        return Fault(
-            "stalled",
-            f"no new sample for {age_s:.0f} s, cycles {state.cycles}",
-            f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal",
-        )
+        remedy = f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal"
+        if state.spoilt:
+            remedy = f"{', '.join(state.spoilt)} was set to no number: only a restart of the device's software helps"
+        return Fault("stalled", f"no new sample for {age_s:.0f} s, cycles {state.cycles}", remedy)
     if overflow_trouble:
         return Fault("overflow_pump", overflow_trouble, "close the device's web page everywhere; restart the device")
     return None
@@ -68,7 +64,7 @@ def fault_of(error: ReactorError, present: bool) -> Fault:
     if isinstance(error, IdentityError):
         return Fault("identity", str(error), "reactors were exchanged: start a new run")
     if not isinstance(error, DeviceStateError):
-        return Fault("link", str(error), "check cable, network and server")
+        return Fault("link", str(error), "asks again every few seconds")
     if present:
         return Fault("selection", str(error), "close the device's web page everywhere")
     return Fault("absent", str(error), "plug it in with the server stopped")

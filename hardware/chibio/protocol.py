@@ -83,7 +83,8 @@ class DeviceState:
 
     sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
     just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
-    regulation. modes: what else would act on its own. slots: of fluorescence, those that the device shows.
+    regulation. modes: what else would act on its own. slots: of fluorescence, those that the device shows. spoilt:
+    pumps that were set to no number, at whose dump in every tenth cycle the thread ends.
     """
 
     selected: str
@@ -112,6 +113,7 @@ class DeviceState:
     volume_ml: float
     terminal: str
     slots: tuple[Slot, ...] = ()
+    spoilt: tuple[str, ...] = ()
 
     @property
     def running_pumps(self) -> tuple[str, ...]:
@@ -236,29 +238,19 @@ def parse_state(body: bytes) -> DeviceState:
         present=tuple(m for m in POSITIONS if isinstance(present, dict) and m in present and _flag(present, m)),
         device_id=_text(data, "DeviceID"),
         version=_line(str(data["Version"].get("value", ""))) if isinstance(data.get("Version"), dict) else "",
-        running=_flag(data, "Experiment", "ON"),
-        cycles=int(cycles),
-        start_time=_text(data, "Experiment", "startTime"),
-        sample_s=_last(data, "time") if whole else math.nan,
-        sample_od=_last(data, "OD") if whole else math.nan,
+        running=_flag(data, "Experiment", "ON"), cycles=int(cycles), start_time=_text(data, "Experiment", "startTime"),
+        sample_s=_last(data, "time") if whole else math.nan, sample_od=_last(data, "OD") if whole else math.nan,
         sample_temperature=_last(data, "ThermometerIR") if whole else math.nan,
-        measuring=_flag(data, "OD", "Measuring"),
-        raw=_number(data, "OD0", "raw"),
-        blank=_number(data, "OD0", "target"),
-        temperature=_number(data, "ThermometerIR", "current"),
-        pumps_on=tuple(_flag(data, p, "ON") for p in PUMPS),
-        pump_targets=tuple(_number(data, p, "target") for p in PUMPS),
-        stirring=_flag(data, "Stir", "ON"),
-        stir_target=_number(data, "Stir", "target"),
-        heating=_flag(data, "Thermostat", "ON"),
-        temperature_target=_number(data, "Thermostat", "target"),
-        regulating=_flag(data, "OD", "ON"),
-        regulation_target=_number(data, "OD", "target"),
-        modes=_modes(data),
-        volume_ml=_number(data, "Volume", "target"),
-        terminal=_terminal(data),
+        measuring=_flag(data, "OD", "Measuring"), raw=_number(data, "OD0", "raw"), blank=_number(data, "OD0", "target"),
+        temperature=_number(data, "ThermometerIR", "current"), pumps_on=tuple(_flag(data, p, "ON") for p in PUMPS),
+        pump_targets=tuple(_number(data, p, "target") for p in PUMPS), stirring=_flag(data, "Stir", "ON"),
+        stir_target=_number(data, "Stir", "target"), heating=_flag(data, "Thermostat", "ON"),
+        temperature_target=_number(data, "Thermostat", "target"), regulating=_flag(data, "OD", "ON"),
+        regulation_target=_number(data, "OD", "target"), modes=_modes(data),
+        volume_ml=_number(data, "Volume", "target"), terminal=_terminal(data),
         slots=tuple(_slot(data, n) for n in SLOTS if n in data),
-    )
+        spoilt=tuple(p for p in PUMPS if any(x != x for x in (data[p]["target"], *data[p].get("record", ())))),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,10 @@ class Sampling:
         """
         note = ""
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
-            note = f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's"
+            late_s = offset - min(self._offsets)
+            note = f"the board's clock moved by {-late_s:.0f} s against this computer's"
+            if late_s > 0.0:
+                note = f"a sample came {late_s:.0f} s late, or the board's clock was set back by that"
             self._offsets.clear()
         if self._looked or (self._offsets and offset < min(self._offsets)):
             self._offsets.append(offset)

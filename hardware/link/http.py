@@ -115,7 +115,11 @@ def fetch(
         raise ProtocolError(f"{what}: not an HTTP answer ({error})") from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
         reason, host = str(error) or type(error).__name__, url.removesuffix(urlsplit(url).path)
-        raise LinkError(f"{what}: no answer from {host} ({reason}); check cable and server") from error
+        slow = isinstance(error, httpx.ReadTimeout)  # it was reached
+        remedy = (
+            "its software hangs: look at the board's disk, close its web page" if slow else "check cable and server"
+        )
+        raise LinkError(f"{what}: no answer from {host} ({reason}); {remedy}") from error
 
 
 class HttpTransport(Transport):

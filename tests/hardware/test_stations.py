@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -239,7 +239,8 @@ def opening(
         with_wall.append("start", {})
         with_wall.append("device", {"reactor": backend.reactors[-1], "temperature": 31.5})
         with_wall.close()
-    return Opening(backend, bench or Bench(), plant or PlantConfig(), Journal(path), folder, resumed)
+    with closing(Journal(path)) as journal:  # one program at a time
+        return Opening(backend, bench or Bench(), plant or PlantConfig(), journal, folder, resumed)
 
 
 class Begun:

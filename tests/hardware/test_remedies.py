@@ -1,0 +1,48 @@
+"""What is told of a device in trouble names what helps, and nothing that is not the cause."""
+
+import json
+import math
+import threading
+
+import pytest
+
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.diagnosis import diagnose, fault_of
+from hardware.chibio.protocol import parse_state
+from hardware.errors import LinkError
+from hardware.link.http import HttpTransport
+from hardware.link.transport import TransportConfig
+from tests.hardware.script import state
+from tests.hardware.test_http_transport import Server
+from tests.patience import PATIENCE_S
+
+
+@pytest.mark.parametrize("where", ["target", "record"])
+def test_a_thread_that_no_number_ended_is_not_said_to_be_mended_by_a_restart_of_the_experiment(where: str) -> None:
+    """The app's record keeps it after the pump has a target again."""
+    changes = {"Pump3__target": math.nan} if where == "target" else {"Pump3__record": [0.0, math.nan, 0.0]}
+    for changed, spoilt in ((changes, ("Pump3",)), ({}, ())):
+        seen = parse_state(json.dumps(state(**changed)).encode())
+        assert seen.spoilt == spoilt
+        fault = diagnose(
+            seen, ChiBioConfig(), age_s=150.0, start_time=seen.start_time, blank=seen.blank, setpoint=math.nan,
+            dosing=False, stuck="", ended="", overflow_trouble="",
+        )  # fmt: skip
+        assert fault is not None
+        assert fault.kind == "stalled"
+        assert ("software" in fault.remedy) == bool(spoilt)
+
+
+def test_the_cable_is_named_once_where_nobody_is_reached_and_never_where_somebody_is() -> None:
+    server, over = Server(), threading.Event()
+    server.behave = lambda c, _: over.wait(PATIENCE_S) and None  # takes the request, and does not answer
+    link = HttpTransport(server.url, 1.0, TransportConfig(read_s=0.2, connect_s=0.2, floor_s=0.1))
+    with pytest.raises(LinkError) as slow:
+        link.get("/getSysdata/")
+    over.set()
+    server.close()
+    with pytest.raises(LinkError) as gone:
+        link.get("/getSysdata/")
+    link.close()
+    counts = [str(fault_of(error.value, present=True)).count("cable") for error in (slow, gone)]
+    assert counts == [0, 1]
