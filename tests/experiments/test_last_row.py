@@ -82,6 +82,5 @@ def test_a_note_of_one_reactor_silences_no_other_and_what_has_doubled_is_told_ag
     heard = said(caplog, [*notes, *quiet])
     assert heard == [note for _, note in [*notes, quiet[1]]]
     assert said(caplog, [(0.0, "M0: 0.3 mL kept"), (3600.0, "M0: 0.2 mL kept")]) == [
-        "M0: 0.3 mL kept",
-        "M0: 0.2 mL kept",
-    ]
+        "M0: 0.3 mL kept", "M0: 0.2 mL kept",
+    ]  # fmt: skip

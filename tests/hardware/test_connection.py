@@ -156,9 +156,8 @@ def test_every_command_and_its_answer_are_logged() -> None:
     with pytest.raises(LinkError):
         m0.switch("Pump2", False)
     assert [(kind, f["path"], f["answer"]) for kind, f in log] == [
-        ("command", OFF[0], 204),
-        ("command", OFF[3], "no answer"),
-    ]
+        ("command", OFF[0], 204), ("command", OFF[3], "no answer"),
+    ]  # fmt: skip
 
 
 def test_a_command_outside_the_limits_never_reaches_the_wire() -> None:
@@ -193,11 +192,9 @@ def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_
 def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
     m0, script = connection([])
     for said, own in (
-        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}),
-        ({"M1": {"Pump1": 3.0}}, {}),
-        ({}, {}),
+        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}), ({"M1": {"Pump1": 3.0}}, {}), ({}, {}),
         (None, None),
-    ):
+    ):  # fmt: skip
         script.switched_off = lambda said=said: said  # type: ignore[method-assign, misc]
         assert m0.switched_off() == own
 

@@ -34,13 +34,8 @@ SCHEDULES = [
     Scenario((0.5, 0.4, 0.3), (30.0, 40.0, 5.0), (37.0, 37.0, 37.0)),
 ]
 LAWS = {
-    "pi": "pi",
-    "pi_tuned": "proportional",
-    "mpc": "midpoint",
-    "inverse": "pi",
-    "dqn": "dqn_preview",
-    "threshold": "pi",
-}
+    "pi": "pi", "pi_tuned": "proportional", "mpc": "midpoint", "inverse": "pi", "dqn": "dqn_preview", "threshold": "pi",
+}  # fmt: skip
 ANEW = {"_fresh_s"}  # of the interlock: begins anew in a resumed run
 BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them than type and shape
 LATER = {"one_line", "_paid_ml", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
