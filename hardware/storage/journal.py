@@ -122,8 +122,10 @@ class Journal:
             sync_folder(path.parent)
         except OSError as error:
             self.close()
-            why = "the run is under way in another program" if isinstance(error, BlockingIOError) else error.strerror
-            raise RecordingError(f"journal {path}: {why or error}; check folder, rights and disk") from error
+            why = f"{error.strerror or error}; check folder, rights and disk"
+            if isinstance(error, BlockingIOError):
+                why = "the run is under way in another program; end that first"
+            raise RecordingError(f"journal {path}: {why}") from error
         try:
             self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
             _check(self.rows, path)
