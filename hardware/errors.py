@@ -4,9 +4,15 @@ Every message names the thing, its value with unit, the allowed range and the re
 """
 
 __all__ = [
-    "DeviceStateError", "IdentityError", "LinkError", "ProtocolError", "ReactorError", "RecordingError",
-    "SensorError", "UnfitError",
-]  # fmt: skip
+    "DeviceStateError",
+    "IdentityError",
+    "LinkError",
+    "ProtocolError",
+    "ReactorError",
+    "RecordingError",
+    "SensorError",
+    "UnfitError",
+]
 
 
 class ReactorError(Exception):

@@ -246,9 +246,12 @@ def not_looked_at() -> Iterator[None]:
 
 
 SHIPPED: Mapping[str, str] = {
-    "sim": "hardware.simulated", "chibio": "hardware.chibio.family", "emulator": "hardware.emulator.family",
-    "pioreactor": "hardware.pioreactor.family", "pioreactor_rig": "hardware.rig.family",
-}  # fmt: skip
+    "sim": "hardware.simulated",
+    "chibio": "hardware.chibio.family",
+    "emulator": "hardware.emulator.family",
+    "pioreactor": "hardware.pioreactor.family",
+    "pioreactor_rig": "hardware.rig.family",
+}
 """The module of each kind that comes with the program; its FAMILY is the object."""
 _loaded: dict[str, Family] = {}
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 __all__ = ["Remembers", "Words", "restore", "restore_rows", "row", "rows", "save", "words"]
 
 KINDS: dict[str, tuple[set[type], str]] = {
-    "b": ({bool}, "true or false"), "i": ({int}, "numbers"), "f": ({int, float, NoneType}, "numbers"),
-}  # fmt: skip
+    "b": ({bool}, "true or false"),
+    "i": ({int}, "numbers"),
+    "f": ({int, float, NoneType}, "numbers"),
+}
 
 
 @runtime_checkable

@@ -68,10 +68,12 @@ class SimulatedReactors:
             self._feed_s = np.zeros(self.plant.n)
         self._sampled = True
         return Measurement(
-            time_s=np.full(self.plant.n, self.elapsed()), od=self.plant.read_od(),
-            temperature=self.plant.thermal.read(), fresh=np.ones(self.plant.n, dtype=np.bool_),
+            time_s=np.full(self.plant.n, self.elapsed()),
+            od=self.plant.read_od(),
+            temperature=self.plant.thermal.read(),
+            fresh=np.ones(self.plant.n, dtype=np.bool_),
             fluorescence=None if self.plant.fluorescence is None else self.plant.read_fluorescence(),
-        )  # fmt: skip
+        )
 
     def actuate(self, command: Command) -> Receipt:
         """Dose once within the coming control period. Raises: nothing."""

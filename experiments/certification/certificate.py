@@ -164,9 +164,14 @@ class Opinion:
 
 
 def judged(
-    policy: Policy, settings: Mapping[str, Any], file: Path, setpoints: Sequence[float], bench: Bench, model: EnvConfig,
+    policy: Policy,
+    settings: Mapping[str, Any],
+    file: Path,
+    setpoints: Sequence[float],
+    bench: Bench,
+    model: EnvConfig,
     name: str,
-) -> Opinion:  # fmt: skip
+) -> Opinion:
     """Judge a policy by its certificate: refuse for safety, tell what its performance lacks.
 
     It is proven anew for the setpoints and the bench of the run: another bench is no reason by itself.

@@ -202,9 +202,15 @@ def published_losses() -> list[str]:
 
 
 def matrix(
-    name: str, title: str, entries: Sequence[Row], text: Callable[[Row], str], note: str, ranked_by: str | None = None,
-    floor: Callable[[Row], str] | None = None, laws_down: bool = False,
-) -> Table:  # fmt: skip
+    name: str,
+    title: str,
+    entries: Sequence[Row],
+    text: Callable[[Row], str],
+    note: str,
+    ranked_by: str | None = None,
+    floor: Callable[[Row], str] | None = None,
+    laws_down: bool = False,
+) -> Table:
     """Plants down, laws across, or the other way round; each plant's lowest `ranked_by` is marked, but not the oracle.
 
     Args: text: of a cell. floor: of the last column, the sensor's noise alone, from any controller's entry.

@@ -165,9 +165,14 @@ class ShareTrial(Trial):
 
 
 def run_trial(
-    cell: Cell, plant_config: PlantConfig, schedule: Scenario, make: Callable[[Plant], Controller], model: EnvConfig,
-    replicates: int, seed: int,
-) -> DensityTrial:  # fmt: skip
+    cell: Cell,
+    plant_config: PlantConfig,
+    schedule: Scenario,
+    make: Callable[[Plant], Controller],
+    model: EnvConfig,
+    replicates: int,
+    seed: int,
+) -> DensityTrial:
     """Run N replicates, which are named M0, M1, ..., as one batch.
 
     The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
@@ -256,18 +261,30 @@ def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Sh
     if cell.calibrated:
         calibrate(estimator, plant, config.seed)
     found = run_share(
-        plant, estimator, law, _beside(config, cell.density), program, np.asarray(scenario.setpoints),
-        np.asarray(scenario.temperatures), scenario.announce_min if cell.announced else 0.0,
-    )  # fmt: skip
+        plant,
+        estimator,
+        law,
+        _beside(config, cell.density),
+        program,
+        np.asarray(scenario.setpoints),
+        np.asarray(scenario.temperatures),
+        scenario.announce_min if cell.announced else 0.0,
+    )
     foresight = cell.announced and kind in registry.FORESIGHT
     minute = np.arange(found["share"].shape[1], dtype=np.float64)
     return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
 
 
 def run_share(
-    plant: Plant, estimator: CompositionEstimator, law: Acts, density: Controller, program: Program, setpoints: Array,
-    temperatures: Array, announce_min: float,
-) -> dict[str, Array]:  # fmt: skip
+    plant: Plant,
+    estimator: CompositionEstimator,
+    law: Acts,
+    density: Controller,
+    program: Program,
+    setpoints: Array,
+    temperatures: Array,
+    announce_min: float,
+) -> dict[str, Array]:
     """Read, decide and dose once a minute to the end of the program: the fields of a `ShareTrial` that are (N, K).
 
     There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors

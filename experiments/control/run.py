@@ -27,7 +27,7 @@ from experiments.record.summary import (
     reasons_line,
     shares_table,
     summarise,
-)  # fmt: skip
+)
 from experiments.reporting import charts
 from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError

@@ -91,10 +91,16 @@ class ClosedLoop:
     remembers = ("began", "done", "stopped")
 
     def __init__(
-        self, reactors: Reactor, controller: Controller, interlock: Interlock, schedules: Sequence[Scenario] | Scenario,
-        before_dose: Callable[[Step], None] | None = None, at_end: Sequence[str] | str = "stop",
-        further: Sequence[Signal] = (), scale: Array | float = 1.0,
-    ) -> None:  # fmt: skip
+        self,
+        reactors: Reactor,
+        controller: Controller,
+        interlock: Interlock,
+        schedules: Sequence[Scenario] | Scenario,
+        before_dose: Callable[[Step], None] | None = None,
+        at_end: Sequence[str] | str = "stop",
+        further: Sequence[Signal] = (),
+        scale: Array | float = 1.0,
+    ) -> None:
         n = len(reactors.names)
         self.reactors, self.interlock = reactors, interlock
         self.density = Density(controller, scale, interlock.bench.max_rate)

@@ -98,9 +98,13 @@ class Share:
     remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(
-        self, estimator: ShareEstimator, law: Law, schedules: Sequence[Scenario], warnings: ShareWarnings | None = None,
+        self,
+        estimator: ShareEstimator,
+        law: Law,
+        schedules: Sequence[Scenario],
+        warnings: ShareWarnings | None = None,
         simulated: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.estimator, self.law, self.controller = estimator, law, Decider(estimator, law)
         self.schedules, self.warnings, self.simulated = schedules, warnings or ShareWarnings(), simulated
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)

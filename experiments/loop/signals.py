@@ -21,9 +21,21 @@ from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
 __all__ = [
-    "ESTIMATED", "FEED", "FILTER_ALARM", "THERMOSTAT", "TRUE", "Counted", "Density", "Findings", "Sample", "Signal",
-    "add", "made", "one_each", "within_2sd",
-]  # fmt: skip
+    "ESTIMATED",
+    "FEED",
+    "FILTER_ALARM",
+    "THERMOSTAT",
+    "TRUE",
+    "Counted",
+    "Density",
+    "Findings",
+    "Sample",
+    "Signal",
+    "add",
+    "made",
+    "one_each",
+    "within_2sd",
+]
 
 FEED, THERMOSTAT = "feed pump", "thermostat"
 TRUE = ("true_error", "true_growth_share")

@@ -23,8 +23,14 @@ from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 
 __all__ = [
-    "ChangeLog", "composition_figure_of", "figure_of", "metrics_table", "reasons_line", "shares_table", "summarise",
-]  # fmt: skip
+    "ChangeLog",
+    "composition_figure_of",
+    "figure_of",
+    "metrics_table",
+    "reasons_line",
+    "shares_table",
+    "summarise",
+]
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from envs.coculture.task import (
     logit,
     passed,
     share,
-)  # fmt: skip
+)
 from experiments.reporting import composition_charts
 from experiments.training.evaluation import Rollout, each, rollout
 

@@ -40,17 +40,22 @@ class ChiBioConfig:
     )
     poll_s: float = setting(2.0, "between two looks for a sample that is due", "s", within=(0.2, 10))
     window_s: float = setting(
-        38.0, "a dose must end this long after its sample appeared; the next measurement begins 47 s after", "s",
+        38.0,
+        "a dose must end this long after its sample appeared; the next measurement begins 47 s after",
+        "s",
         within=(10, 42),
-    )  # fmt: skip
+    )
     retry_s: float = setting(5.0, "before a failed request is tried again", "s", within=(0.5, 60))
     stop_s: float = setting(
         60.0, "how long a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
     )
     deadman_s: float = setting(
-        120.0, "silence after which a board agent, where there is one, switches pumps off: its --deadman", "s",
-        within=(20, 3600), note="what a dose may have repeated until then is booked",
-    )  # fmt: skip
+        120.0,
+        "silence after which a board agent, where there is one, switches pumps off: its --deadman",
+        "s",
+        within=(20, 3600),
+        note="what a dose may have repeated until then is booked",
+    )
     recover: bool = setting(True, "restore and restart a device that lost its memory or whose thread died")
 
     def __post_init__(self) -> None:

@@ -13,9 +13,15 @@ from conf.schema import check, require, setting
 from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
 
 __all__ = [
-    "DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCalibration", "SupplyConfig", "fit_pump",
+    "DosePlan",
+    "DosingConfig",
+    "PumpCalibration",
+    "PumpFit",
+    "ReactorCalibration",
+    "SupplyConfig",
+    "fit_pump",
     "plan_dose",
-]  # fmt: skip
+]
 
 Array = NDArray[np.float64]
 
@@ -131,8 +137,10 @@ class SupplyConfig:
         check(self, "backend.supply")
         for pump in self.pumps:  # else a dose that it cannot deliver would be owed for ever, in the feed's place
             key, flow, least = (
-                f"backend.supply.{pump.lower()}_ml_s", self.flow_ml_s(pump), self.calibration(pump).min_dose_ml,
-            )  # fmt: skip
+                f"backend.supply.{pump.lower()}_ml_s",
+                self.flow_ml_s(pump),
+                self.calibration(pump).min_dose_ml,
+            )
             require(flow >= 0.2, key, flow, "0 or 0.2 to 1.5 mL/s")
             require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
 
@@ -213,9 +221,12 @@ def plan_dose(
     waste_duty = min(math.ceil(waste_s / PERIOD_S * 1e6) / 1e6, MAX_WASTE_DUTY)
     left = max(volume - feed_ml, 0.0)
     return DosePlan(
-        feed_duty=feed_duty, waste_duty=waste_duty, feed_ml=feed_ml, waste_ml=waste.volume(PERIOD_S * waste_duty),
+        feed_duty=feed_duty,
+        waste_duty=waste_duty,
+        feed_ml=feed_ml,
+        waste_ml=waste.volume(PERIOD_S * waste_duty),
         shortfall_ml=left if duty > feed_duty else 0.0,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

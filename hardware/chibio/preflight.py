@@ -26,9 +26,13 @@ FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md
 
 
 def preflight(
-    transport: Transport, clock: Clock, config: ChiBioConfig, calibrations: list[ReactorCalibration],
-    folder: Path | None = None, bench: Bench | None = None,
-) -> list[Check]:  # fmt: skip
+    transport: Transport,
+    clock: Clock,
+    config: ChiBioConfig,
+    calibrations: list[ReactorCalibration],
+    folder: Path | None = None,
+    bench: Bench | None = None,
+) -> list[Check]:
     """Disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors, pump calibration.
 
     Args:
@@ -101,17 +105,21 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration],
     overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
     if not overflow.pump:
         return Check(
-            "overflow pump", False,
+            "overflow pump",
+            False,
             f"none: with a blocked waste tube a vial overflows after about {room_ml:.0f} mL of feed",
-            "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/device.md)", required=False,
-        )  # fmt: skip
+            "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/device.md)",
+            required=False,
+        )
     covers = "a blocked waste tube" + " and a feed motor stuck on" * (overflow.removes_ml_s > MARGIN * feed)
     return Check(
-        "overflow pump", overflow.removes_ml_s > MAX_FEED_DUTY * feed,
+        "overflow pump",
+        overflow.removes_ml_s > MAX_FEED_DUTY * feed,
         f"{overflow.pump} at duty {overflow.duty:g} takes {overflow.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s "
         f"at full power: covers {covers}; verified on when the run starts",
-        "less than the largest feed: raise backend.overflow_pump.duty", required=False,
-    )  # fmt: skip
+        "less than the largest feed: raise backend.overflow_pump.duty",
+        required=False,
+    )
 
 
 def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig) -> Check:
@@ -137,39 +145,53 @@ def _reactor(name: str, state: DeviceState, calibration: ReactorCalibration, con
     blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
     source = "stored" if math.isfinite(calibration.blank) else "of the device"
     yield Check(
-        f"{name} blank", 3000.0 <= blank <= 60000.0 and blank != UNSET_BLANK, f"{blank:.0f} counts ({source})",
+        f"{name} blank",
+        3000.0 <= blank <= 60000.0 and blank != UNSET_BLANK,
+        f"{blank:.0f} counts ({source})",
         "measure it with clear medium: python -m experiments.blank",
-    )  # fmt: skip
+    )
     modes = config.fluorescence.others_on(state)
     yield Check(
-        f"{name} modes", not modes and not state.regulating,
+        f"{name} modes",
+        not modes and not state.regulating,
         ", ".join([*modes, *(["OD regulation"] if state.regulating else [])]) or "none active",
-        "switch them off in the web page (OD regulation is switched off by the run itself)", required=bool(modes),
-    )  # fmt: skip
+        "switch them off in the web page (OD regulation is switched off by the run itself)",
+        required=bool(modes),
+    )
     yield Check(
-        f"{name} temperature", 10.0 < state.temperature < 45.0, f"{state.temperature:.1f} degC",
+        f"{name} temperature",
+        10.0 < state.temperature < 45.0,
+        f"{state.temperature:.1f} degC",
         "check that the vial is seated under the thermometer",
-    )  # fmt: skip
+    )
     yield Check(
-        f"{name} light sensor", state.cycles == 0 or state.raw >= 5.0,
-        f"raw {state.raw:.0f} after {state.cycles} cycles", "check the spectrometer; restart the device",
-    )  # fmt: skip
+        f"{name} light sensor",
+        state.cycles == 0 or state.raw >= 5.0,
+        f"raw {state.raw:.0f} after {state.cycles} cycles",
+        "check the spectrometer; restart the device",
+    )
     feed, waste = calibration.feed, calibration.waste
     same = all(not p.device_id or p.device_id == state.device_id for p in (feed, waste))
     dates = f"feed {feed.date or 'never weighed'}, waste {waste.date or 'never weighed'}"
     yield Check(
-        f"{name} pump calibration", calibration.calibrated and same, dates + ("" if same else ", on another unit"),
+        f"{name} pump calibration",
+        calibration.calibrated and same,
+        dates + ("" if same else ", on another unit"),
         f"python -m experiments.calibrate_pump reactor={name}; until then {feed.flow_ml_s:g} mL/s is assumed",
         required=False,
-    )  # fmt: skip
+    )
     stronger = 4.0 * waste.flow_ml_s / feed.flow_ml_s
     yield Check(
-        f"{name} waste over feed", stronger >= 1.5, f"waste moves {stronger:.1f} times the feed in its on-time",
+        f"{name} waste over feed",
+        stronger >= 1.5,
+        f"waste moves {stronger:.1f} times the feed in its on-time",
         "exchange or repair the waste pump",
-    )  # fmt: skip
+    )
     on = config.overflow_pump.others_on(state)
     yield Check(
-        f"{name} pumps", not on, f"{on or 'all'} {'on' if on else 'off'}",
+        f"{name} pumps",
+        not on,
+        f"{on or 'all'} {'on' if on else 'off'}",
         f"an earlier client left them on, each repeats its dose every {PERIOD_S:.0f} s; the run switches them off",
         required=False,
-    )  # fmt: skip
+    )

@@ -42,9 +42,14 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
     """
 
     def __init__(
-        self, transport: Transport, clock: Clock, config: ChiBioConfig,
-        calibrations: Sequence[ReactorCalibration] | None = None, log: Log = no_log, bench: Bench | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        transport: Transport,
+        clock: Clock,
+        config: ChiBioConfig,
+        calibrations: Sequence[ReactorCalibration] | None = None,
+        log: Log = no_log,
+        bench: Bench | None = None,
+    ) -> None:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")

@@ -75,10 +75,16 @@ class ChiBioDevice:
     """
 
     def __init__(
-        self, reactors: Sequence[str], clock: Clock, rng: np.random.Generator, options: DeviceOptions | None = None,
-        od: float | Sequence[float] = 0.3, temperature: float = 24.0, blanked: bool = False,
+        self,
+        reactors: Sequence[str],
+        clock: Clock,
+        rng: np.random.Generator,
+        options: DeviceOptions | None = None,
+        od: float | Sequence[float] = 0.3,
+        temperature: float = 24.0,
+        blanked: bool = False,
         volumes_ml: float | Sequence[float] = Bench.volume_ml,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not reactors or len(set(reactors)) != len(reactors) or not set(reactors) <= set(ALL_REACTORS):
             raise ValueError(f"reactors = {','.join(reactors)}: allowed a list of different names from M0 to M7")
         ods, tubes_ml = _each("od", od, len(reactors)), _each("volume", volumes_ml, len(reactors))

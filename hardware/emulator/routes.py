@@ -118,22 +118,26 @@ def _characterise(s: Software, m: str, program: str) -> None:
 
 
 ROUTES = (
-    Route("GET", "/", lambda s: None), Route("GET", "/getSysdata/", lambda s: None),
-    Route("POST", "/changeDevice/*", _change), Route("POST", "/scanDevices/*", _scan),
+    Route("GET", "/", lambda s: None),
+    Route("GET", "/getSysdata/", lambda s: None),
+    Route("POST", "/changeDevice/*", _change),
+    Route("POST", "/scanDevices/*", _scan),
     Route("POST", "/SetOutputTarget/*/*/*", lambda s, item, m, value: s.app(m).outputs.set_target(item, float(value))),
     Route("POST", "/SetOutputOn/*/*/*", lambda s, item, force, m: s.app(m).outputs.set_on(item, int(force))),
     Route("POST", "/Direction/*/*", _direction),
     Route("POST", "/MeasureOD/*", lambda s, m: s.app(m).optics.measure_od()),
-    Route("POST", "/CalibrateOD/*/*/*/*", _calibrate), Route("POST", "/MeasureTemp/*/*", _measure_temperature),
+    Route("POST", "/CalibrateOD/*/*/*/*", _calibrate),
+    Route("POST", "/MeasureTemp/*/*", _measure_temperature),
     Route("POST", "/MeasureFP/*", lambda s, m: s.app(m).optics.measure_fluorescence()),
     Route("POST", "/GetSpectrum/*/*", _spectrum),
     Route("POST", "/Experiment/*/*", lambda s, value, m: s.app(m).experiment.start_or_stop(int(value))),
     Route("POST", "/ExperimentReset", _reset),
     Route("POST", "/ClearTerminal/*", lambda s, m: clear_terminal(s.app(m).data, s.computer.stamp())),
-    Route("POST", "/SetFPMeasurement/*/*/*/*/*/*", _set_fp), Route("POST", "/SetCustom/*/*", _set_custom),
+    Route("POST", "/SetFPMeasurement/*/*/*/*/*/*", _set_fp),
+    Route("POST", "/SetCustom/*/*", _set_custom),
     Route("POST", "/SetLightActuation/*", lambda s, led: _toggle(s.apps[s.selected].data["Light"], Excite=led)),
     Route("POST", "/CharacteriseDevice/*/*", _characterise),
-)  # fmt: skip
+)
 
 
 def _split(path: str) -> list[str]:

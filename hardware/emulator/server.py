@@ -239,15 +239,20 @@ def parser() -> argparse.ArgumentParser:
     add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
     for pump in SPARE:
         add(
-            f"--{pump.lower()}-flow", type=float, default=0.0,
+            f"--{pump.lower()}-flow",
+            type=float,
+            default=0.0,
             help=f"{pump} supplies a second fluid, mL/s (default: no)",
-        )  # fmt: skip
+        )
     add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
     add(
-        "--pump-start", type=float, nargs=2, metavar=("LOW", "HIGH"),
+        "--pump-start",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
         default=(start.pump_start_low_s, start.pump_start_high_s),
         help="from the answer to a pump command until its motor turns, s (default %(default)s)",
-    )  # fmt: skip
+    )
     add("--unit", type=int, default=os.getpid(), help="which of several devices: its identities (default: own ones)")
     add("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
@@ -273,12 +278,15 @@ def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDe
     plant = of_pair(plant_preset(arguments.plant), named_pair(arguments.pair))
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
-        tuple(arguments.reactors.split(",")), clock or DeviceClock(arguments.speed),
-        np.random.default_rng(arguments.seed), DeviceOptions(unit=arguments.unit, vial=vial, plant=plant), od=ods,
+        tuple(arguments.reactors.split(",")),
+        clock or DeviceClock(arguments.speed),
+        np.random.default_rng(arguments.seed),
+        DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
+        od=ods,
         volumes_ml=volumes_ml,
         temperature=plant.start_temperature if arguments.temperature is None else arguments.temperature,
         blanked=not arguments.unblanked,
-    )  # fmt: skip
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

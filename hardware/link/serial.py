@@ -74,9 +74,13 @@ class SerialTransport(Transport):
     """
 
     def __init__(
-        self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5,
+        self,
+        port: str,
+        speed: float = 1.0,
+        config: TransportConfig | None = None,
+        attempts: int = 5,
         session: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.port, self._clock, self._attempts = port, DeviceClock(speed), attempts
         self._config = config or TransportConfig(kind="serial")
         self._line: serial.Serial | None = None

@@ -64,9 +64,13 @@ class Interlock:
     remembers = ("_hold_until_s", "_hold_kind", "_latched")
 
     def __init__(
-        self, n: int, config: SafetyConfig | None = None, bench: Bench | None = None, tube_ml: Array | None = None,
+        self,
+        n: int,
+        config: SafetyConfig | None = None,
+        bench: Bench | None = None,
+        tube_ml: Array | None = None,
         rim_ml: Array | float = math.inf,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.bench = bench or Bench()
         self.n, self.config = n, config or SafetyConfig()
         tube = np.full(n, self.bench.volume_ml) if tube_ml is None else tube_ml

@@ -65,9 +65,14 @@ class Recording:
 
 
 def read_recording(
-    path: str | Path, *, pump_ml_s: float = 1.0, pumps: Sequence[int] = (1,), run: int | None = None,
-    reactor: str | None = None, rows: Rows = (0, None),
-) -> Recording:  # fmt: skip
+    path: str | Path,
+    *,
+    pump_ml_s: float = 1.0,
+    pumps: Sequence[int] = (1,),
+    run: int | None = None,
+    reactor: str | None = None,
+    rows: Rows = (0, None),
+) -> Recording:
     """Read a recording from a Chi.Bio's own CSV, from `Recorder`'s, or from a tidy three-column file.
 
     Known layouts: the Chi.Bio's named columns (exp_time in s, od_measured, pump_1_rate as a share of full power), the
@@ -111,10 +116,17 @@ def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[
     ends = tuple((int(table.number[r.rows[0]]), int(table.number[r.rows[-1]])) for r in runs)
     table = table.only(keep)
     return Recording(
-        time_min=table.time_min, od=_usable_od(path, table.od, table.number, notes), pump_rate=table.pump_rate,
-        temperature=table.temperature, row=table.number, notes=tuple(notes), source=source, runs=ends,
-        fluorescence=table.fluorescence, doubts=doubts,
-    )  # fmt: skip
+        time_min=table.time_min,
+        od=_usable_od(path, table.od, table.number, notes),
+        pump_rate=table.pump_rate,
+        temperature=table.temperature,
+        row=table.number,
+        notes=tuple(notes),
+        source=source,
+        runs=ends,
+        fluorescence=table.fluorescence,
+        doubts=doubts,
+    )
 
 
 def _with_times_and_rates(path: Path, table: Table, notes: list[str]) -> Table:

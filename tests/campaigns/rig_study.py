@@ -98,9 +98,22 @@ def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
     """table.md: how the setpoints were held, and what became of the doses."""
     head = ("unit", "setpoint", f"mean error, last {rig_truth.LAST_MIN:.0f} min")
     rows = [(u.unit, f"{h.setpoint:g}", f"{h.last_error_od:.4f}") for u in found for h in u.held]
-    doses = ("unit", "doses", "runs of the pump", "error, mL: mean", "largest", "outside of the bound, mL",
-             "cut short", "without intent", "twice", "missing", "given, mL", "booked, mL", "difference",
-             "largest volume, mL")  # fmt: skip
+    doses = (
+        "unit",
+        "doses",
+        "runs of the pump",
+        "error, mL: mean",
+        "largest",
+        "outside of the bound, mL",
+        "cut short",
+        "without intent",
+        "twice",
+        "missing",
+        "given, mL",
+        "booked, mL",
+        "difference",
+        "largest volume, mL",
+    )
     said = [f"Growth {run.speed:g} times faster than real time.", ""]
     return "\n".join([*said, markdown(head, rows), markdown(doses, map(_dose_row, found))])
 

@@ -45,9 +45,11 @@ def test_a_window_holds_doses() -> None:
     grown = culture(np.zeros(500), 0.001)
     dosed = culture(doses(330))
     whole = Series(
-        np.concatenate([grown.time, 560.0 + dosed.time]), np.concatenate([grown.od, dosed.od]),
-        np.concatenate([grown.pump_rate, dosed.pump_rate]), np.arange(830),
-    )  # fmt: skip
+        np.concatenate([grown.time, 560.0 + dosed.time]),
+        np.concatenate([grown.od, dosed.od]),
+        np.concatenate([grown.pump_rate, dosed.pump_rate]),
+        np.arange(830),
+    )
     found = calibrate(whole)
     assert found.window == (500, 830)
     assert found.tau.value == pytest.approx(TAU, rel=0.05)

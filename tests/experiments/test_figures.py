@@ -750,8 +750,10 @@ def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_fr
     od, best, rates, most = (np.repeat(each, 20, axis=0) for each in (od, best, 10.0 * rates, 10.0 * most))
     axes = charts.relative_trajectories(od, best, np.array([0.9, 0.1, 0.9]), rates, most).axes
     assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == (
-        "control periods", f"error e, {PERIODS}", "dose, share of full pump"
-    )  # fmt: skip
+        "control periods",
+        f"error e, {PERIODS}",
+        "dose, share of full pump",
+    )
     for column, (to, members) in enumerate(((0.1, (1,)), (0.9, (0, 2)))):
         assert axes[column].get_title() == f"growth takes {to:g} of the pump"
         for k, g in enumerate(members):
@@ -791,9 +793,15 @@ def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale
     for drawn, scale, end, *said in (
         (charts.policy_map(x, y, none, most), 1000.0, 30.0, "OD x", "setpoint, OD", PUMP),
         (charts.policy_map(x, y, none, most / 2.0), 500.0, 20.0, "OD x", "setpoint, OD", PUMP),
-        (charts.relative_map(x, y, none, most), 1.0, 1.0, f"error e, {PERIODS}", "growth's share of the pump, s",
-         "dose, share of full pump"),
-    ):  # fmt: skip
+        (
+            charts.relative_map(x, y, none, most),
+            1.0,
+            1.0,
+            f"error e, {PERIODS}",
+            "growth's share of the pump, s",
+            "dose, share of full pump",
+        ),
+    ):
         assert [label(drawn.axes[0], "x"), label(drawn.axes[0], "y"), drawn.axes[2].get_ylabel()] == said
         for ax, title, rates in zip(
             drawn.axes, ("learned policy", "optimum (dynamic programming)"), (none, most), strict=False

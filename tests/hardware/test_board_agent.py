@@ -120,9 +120,14 @@ def test_a_damaged_frame_is_never_taken_for_another(number: int, path: str, data
 
 @pytest.mark.parametrize(
     ("number", "method", "path"),
-    [*((n, "GET", "/") for n in (0, 2**32, -1)), (1, "PUT", "/"), (1, "get", "/"), (1, "PING", "/getSysdata/"),
-     *((1, "GET", path) for path in ("getSysdata", "/a b", "/a\tb", "/" + "x" * 600))],
-)  # fmt: skip
+    [
+        *((n, "GET", "/") for n in (0, 2**32, -1)),
+        (1, "PUT", "/"),
+        (1, "get", "/"),
+        (1, "PING", "/getSysdata/"),
+        *((1, "GET", path) for path in ("getSysdata", "/a b", "/a\tb", "/" + "x" * 600)),
+    ],
+)
 def test_well_summed_nonsense_is_refused(number: int, method: str, path: str) -> None:
     assert decode_request(encode_request(number, method, path)[:-1]) is None
 

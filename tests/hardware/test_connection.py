@@ -192,9 +192,11 @@ def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_
 def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
     m0, script = connection([])
     for said, own in (
-        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}), ({"M1": {"Pump1": 3.0}}, {}), ({}, {}),
+        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}),
+        ({"M1": {"Pump1": 3.0}}, {}),
+        ({}, {}),
         (None, None),
-    ):  # fmt: skip
+    ):
         script.switched_off = lambda said=said: said  # type: ignore[method-assign, misc]
         assert m0.switched_off() == own
 

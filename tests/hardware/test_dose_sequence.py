@@ -162,11 +162,12 @@ def test_a_pump_command_whose_answer_is_lost_is_not_sent_again(
 @pytest.mark.parametrize(
     ("sample", "past_s", "refusal", "words"),
     [
-        (None, 0.0, "", "no new sample"), ((60.0, 2), math.inf, "", "unknown age"),
+        (None, 0.0, "", "no new sample"),
+        ((60.0, 2), math.inf, "", "unknown age"),
         ((60.0, 2), 38.0 - WASTE_S + 0.01, "", "31 s after its sample appeared it would not end"),
         ((60.0, 2), 0.0, "being started", "being started"),
     ],
-)  # fmt: skip
+)
 def test_what_stands_in_the_way_of_a_dose(sample: Any, past_s: float, refusal: str, words: str) -> None:
     bench = Bench()
     assert bench.begin(0.01, sample, past_s, refusal) == DosePlan()
@@ -201,11 +202,16 @@ def test_a_read_back_that_takes_too_long_ends_the_dose_before_a_pump_is_on(late_
 @pytest.mark.parametrize(
     ("shown", "begun"),
     [
-        ({}, True), ({"Pump1__target": FEED_DUTY + 0.9e-5}, True), ({"Pump1__target": FEED_DUTY + 1.1e-5}, False),
-        ({"Pump2__target": WASTE_DUTY - 0.9e-5}, True), ({"Pump2__target": WASTE_DUTY - 1.1e-5}, False),
-        ({"Pump3__ON": 1}, False), ({"OD__ON": 1}, False), ({"Experiment__ON": 0}, False),
+        ({}, True),
+        ({"Pump1__target": FEED_DUTY + 0.9e-5}, True),
+        ({"Pump1__target": FEED_DUTY + 1.1e-5}, False),
+        ({"Pump2__target": WASTE_DUTY - 0.9e-5}, True),
+        ({"Pump2__target": WASTE_DUTY - 1.1e-5}, False),
+        ({"Pump3__ON": 1}, False),
+        ({"OD__ON": 1}, False),
+        ({"Experiment__ON": 0}, False),
     ],
-)  # fmt: skip
+)
 def test_a_dose_begins_only_where_the_device_shows_what_was_set(shown: dict[str, Any], begun: bool) -> None:
     bench = Bench()
     bench.line.shown = shown
@@ -353,8 +359,10 @@ def test_a_dose_that_is_cut_short_gave_less() -> None:
     assert ended(bench) == {"feed_ml": 0.25, "waste_ml": 1.25, "feed_times": 0, "waste_times": 0, "on_s": 1.0}
     [less] = bench.doses.extra
     assert (less.at_s, round(less.feed_ml, 3), round(less.low_ml, 3)) == (
-        1.0, round(0.25 - FEED_S, 3), -round(FEED_S, 3),
-    )  # fmt: skip
+        1.0,
+        round(0.25 - FEED_S, 3),
+        -round(FEED_S, 3),
+    )
     bench.doses.settle()
     assert len(bench.of("dose_end")) == 1
 

@@ -116,9 +116,13 @@ def test_a_pump_nobody_weighed() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.floats(0.0, 0.05), st.floats(0.0, 0.5), st.integers(0, 100), st.floats(0.1, 3.0), st.floats(0.1, 3.0),
+    st.floats(0.0, 0.05),
+    st.floats(0.0, 0.5),
+    st.integers(0, 100),
+    st.floats(0.1, 3.0),
+    st.floats(0.1, 3.0),
     st.floats(-0.2, 0.3),
-)  # fmt: skip
+)
 def test_no_plan_breaks_a_limit(rate: float, carry: float, doses: int, q1: float, q2: float, bias: float) -> None:
     rig = ReactorCalibration(PumpCalibration(q1, bias), PumpCalibration(q2, bias))
     plan = plan_dose(rate, carry, doses, rig, CONFIG)
@@ -170,14 +174,19 @@ def test_the_smallest_useful_time(on_s: list[float], mean: list[float], smallest
 @pytest.mark.parametrize(
     ("on_s", "grams", "words"),
     [
-        ([1.0], [20.0], "at least 2 series"), ([1.0, 1.0], [20.0, 21.0], "range"),
-        ([0.5, 1.0], [20.0, 10.0], "weighed less"), ([0.5, 1.0], [20.0, np.nan], "finite"),
-        ([0.5, 1.0], [20.0, np.inf], "finite"), ([0.5, 1.0], [1000.0, 3000.0], "allowed"),
-        ([0.5, 1.0], [20.0, 20.0], "weighed less"), ([0.0, 1.0], [1.0, 20.0], "must be > 0 s"),
-        ([0.5, 1.0], [-0.1, 20.0], "grams >= 0"), ([0.5, 0.65], [10.0, 13.0], "0.50 to 0.65 s: allowed a range"),
+        ([1.0], [20.0], "at least 2 series"),
+        ([1.0, 1.0], [20.0, 21.0], "range"),
+        ([0.5, 1.0], [20.0, 10.0], "weighed less"),
+        ([0.5, 1.0], [20.0, np.nan], "finite"),
+        ([0.5, 1.0], [20.0, np.inf], "finite"),
+        ([0.5, 1.0], [1000.0, 3000.0], "allowed"),
+        ([0.5, 1.0], [20.0, 20.0], "weighed less"),
+        ([0.0, 1.0], [1.0, 20.0], "must be > 0 s"),
+        ([0.5, 1.0], [-0.1, 20.0], "grams >= 0"),
+        ([0.5, 0.65], [10.0, 13.0], "0.50 to 0.65 s: allowed a range"),
         ([0.5, 1.0], [20.0], "2, 2, 1"),
     ],
-)  # fmt: skip
+)
 def test_weighings_that_make_no_line_are_refused(on_s: list[float], grams: list[float], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         fit_pump(np.array(on_s), np.full(len(on_s), 20), np.array(grams))
@@ -210,9 +219,10 @@ def test_spare_pumps_have_each_their_own_flow_and_both_the_same_bias() -> None:
     [
         ({"pump4_ml_s": 0.19}, "backend.supply.pump4_ml_s = 0.19: allowed 0 or 0.2 to 1.5 mL/s"),
         ({"pump3_ml_s": 1.5, "bias_s": 0.1}, "backend.supply.pump3_ml_s = 1.5: allowed so much that .* at most 0.5 mL"),
-        ({"pump3_ml_s": 1.5, "bias_s": 0.03}, None), ({"pump4_ml_s": 0.2}, None),
+        ({"pump3_ml_s": 1.5, "bias_s": 0.03}, None),
+        ({"pump4_ml_s": 0.2}, None),
     ],
-)  # fmt: skip
+)
 def test_a_spare_pump_can_give_the_smallest_dose(values: dict[str, float], words: str | None) -> None:
     if words is None:
         SupplyConfig(**values)
@@ -239,11 +249,14 @@ def test_each_reactor_s_pumps_and_blank_are_those_of_its_own_files(tmp_path: Pat
     ("content", "words"),
     [
         ("blank: 60001", r"calibration of M3 in .*: blank = 60001.0: allowed 3000 to 60000 counts"),
-        ("blank: 2999", "blank = 2999.0"), ("blank: dark", "calibration of M3"),
-        ("- 1", "M3_blank.yaml: no keys and values"), ("blank: {", "M3_blank.yaml: not readable"),
-        ("blank: 60000", None), ("", None),
+        ("blank: 2999", "blank = 2999.0"),
+        ("blank: dark", "calibration of M3"),
+        ("- 1", "M3_blank.yaml: no keys and values"),
+        ("blank: {", "M3_blank.yaml: not readable"),
+        ("blank: 60000", None),
+        ("", None),
     ],
-)  # fmt: skip
+)
 def test_a_blank_that_is_none_names_its_reactor(tmp_path: Path, content: str, words: str | None) -> None:
     save_calibration(tmp_path, "M0", "blank", {"blank": 12000.0})
     (tmp_path / "M3_blank.yaml").write_text(content)

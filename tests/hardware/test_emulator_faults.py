@@ -70,8 +70,12 @@ def test_touching_an_absent_reactor_ends_everything() -> None:
 
 
 DEADLY = "MeasureOD/M5 MeasureTemp/Internal/M5 SetOutputOn/Stir/1/M5 SetOutputOn/LEDA/1/M5 Experiment/1/M5"
-ANSWERED = {"SetOutputOn/Pump1/0/M5": False, "SetOutputTarget/Pump1/M5/0.1": True, "changeDevice/M5": True,
-            "scanDevices/M5": True}  # fmt: skip
+ANSWERED = {
+    "SetOutputOn/Pump1/0/M5": False,
+    "SetOutputTarget/Pump1/M5/0.1": True,
+    "changeDevice/M5": True,
+    "scanDevices/M5": True,
+}
 
 
 @pytest.mark.parametrize("path", [*DEADLY.split(), "GetSpectrum/x1/M5", *ANSWERED])

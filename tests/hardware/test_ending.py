@@ -36,9 +36,12 @@ def read(feed: bool, waste: bool, start_time: str = START, **changes: Any) -> De
 
 
 def after(
-    known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float = 101.0,
+    known: ReactorHistory,
+    state: DeviceState,
+    now_s: float,
+    seen_s: float = 101.0,
     stopped: dict[str, float] | None = None,
-) -> tuple[Ending, str]:  # fmt: skip
+) -> tuple[Ending, str]:
     """How the dose ended that is known and was looked at so, its pumps verified off at once."""
     row = found(known, state, now_s, seen_s, SILENCE_S, stopped)
     return conclude(known.after({"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)

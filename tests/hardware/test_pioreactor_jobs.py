@@ -206,9 +206,12 @@ class Said:
     def get(self, path: str, below: str = "/unit_api") -> Any:
         curves = {"media_pump": {"curve_data_": [0.7, 0.0]}, "waste_pump": {"curve_data_": [1.6, 0.0]}}
         return {
-            "health": {"pioreactor_unit": "pio02", "utc_time": "2026-11-21T00:00:00Z"}, "app": {"version": "26.7.2"},
-            "experiment": {"experiment": "turbidostat"}, "active_calibrations": curves, "merged": self.settings,
-        }[name := path.rpartition("/")[2]] | self.answers.get(name, {})  # fmt: skip
+            "health": {"pioreactor_unit": "pio02", "utc_time": "2026-11-21T00:00:00Z"},
+            "app": {"version": "26.7.2"},
+            "experiment": {"experiment": "turbidostat"},
+            "active_calibrations": curves,
+            "merged": self.settings,
+        }[name := path.rpartition("/")[2]] | self.answers.get(name, {})
 
     astray = Web.astray
     _experiment = "turbidostat"
@@ -384,10 +387,13 @@ def test_a_turbidostat_regulates_only_by_what_it_was_asked_for():
 def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     config = PioreactorConfig(reactors=("pio01", "pio02"), max_dose_ml=1.2)
     web: Any = Said(
-        {"1": "90", "2": "REF", "3": "135"}, "20", ("od_reading", "circulate_media", "add_alt_media", "stirring"),
-        health={"pioreactor_unit": "pio09", "utc_time": "2001-11-21T00:00:00Z"}, app={"version": "26.1.30"},
+        {"1": "90", "2": "REF", "3": "135"},
+        "20",
+        ("od_reading", "circulate_media", "add_alt_media", "stirring"),
+        health={"pioreactor_unit": "pio09", "utc_time": "2001-11-21T00:00:00Z"},
+        app={"version": "26.1.30"},
         experiment={"experiment": "older"},
-    )  # fmt: skip
+    )
     unit = SimpleNamespace(web=web, leader=web, config=config.of("pio02"), volume_ml=14.0)
     mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
     web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}

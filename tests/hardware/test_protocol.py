@@ -71,10 +71,13 @@ def test_forks_with_a_list_terminal_extra_and_missing_fields() -> None:
 @pytest.mark.parametrize(
     ("newest", "ended"),
     [
-        ("Experiment {}Stopped", True), ("Experiment {}Stopping at end of cycle", False),
-        ("Experiment {}Started", False), ("Cycle 4 {}Complete", False), ("Terminal {}Cleared", False),
+        ("Experiment {}Stopped", True),
+        ("Experiment {}Stopping at end of cycle", False),
+        ("Experiment {}Started", False),
+        ("Cycle 4 {}Complete", False),
+        ("Terminal {}Cleared", False),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("named", ["", "on M0 ", "on M0 (1000200030004000) "])
 def test_only_the_newest_line_says_whether_an_experiment_has_ended(newest: str, ended: bool, named: str) -> None:
     """Older apps do not name the reactor."""

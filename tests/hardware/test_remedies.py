@@ -25,9 +25,17 @@ def test_a_thread_that_no_number_ended_is_not_said_to_be_mended_by_a_restart_of_
         seen = parse_state(json.dumps(state(**changed)).encode())
         assert seen.spoilt == spoilt
         fault = diagnose(
-            seen, ChiBioConfig(), age_s=150.0, start_time=seen.start_time, blank=seen.blank, setpoint=math.nan,
-            dosing=False, stuck="", ended="", overflow_trouble="",
-        )  # fmt: skip
+            seen,
+            ChiBioConfig(),
+            age_s=150.0,
+            start_time=seen.start_time,
+            blank=seen.blank,
+            setpoint=math.nan,
+            dosing=False,
+            stuck="",
+            ended="",
+            overflow_trouble="",
+        )
         assert fault is not None
         assert fault.kind == "stalled"
         assert ("software" in fault.remedy) == bool(spoilt)

@@ -364,10 +364,12 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
     rng = np.random.default_rng(2)
     seen: set[str] = set()
     others = (
-        SafetyConfig(jump=0.2, mu_max=0.03), SafetyConfig(jump_fraction=0.3, death=0.03),
-        SafetyConfig(mu_max=0.01, drift=0.2), SafetyConfig(noise_od=0.02, noise_fraction=0.001),
+        SafetyConfig(jump=0.2, mu_max=0.03),
+        SafetyConfig(jump_fraction=0.3, death=0.03),
+        SafetyConfig(mu_max=0.01, drift=0.2),
+        SafetyConfig(noise_od=0.02, noise_fraction=0.001),
         SafetyConfig(noise_od=0.001, noise_fraction=0.03, drift=0.02),
-    )  # fmt: skip
+    )
     for k, config in enumerate([C] * 6 + [*others]):
         given = (config, 0.006 if k % 3 == 2 else 0.02, TUBES)
         change, twins = UnexplainedChange(*given), [Culture(tube, *given[:2]) for tube in TUBES.tolist()]

@@ -86,8 +86,13 @@ def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_w
         late.append(sampling.late_s)
     assert late == [0.0, 0.0, 3.0, 1.0, 3.0, 0.0]  # against 5, 3, 3, 3, 4, 2
     rest = (
-        (5.0, False, 3.0), (6.0, True, 4.0), (6.5, True, 4.5), (9.0, False, 7.0), (1.0, False, 0.0), (2.0, True, 1.0),
-    )  # fmt: skip
+        (5.0, False, 3.0),
+        (6.0, True, 4.0),
+        (6.5, True, 4.5),
+        (9.0, False, 7.0),
+        (1.0, False, 0.0),
+        (2.0, True, 1.0),
+    )
     for k, (offset, waited, expected) in enumerate(rest, 7):
         if waited:
             sampling.not_taken(is_new=False)

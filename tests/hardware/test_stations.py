@@ -225,9 +225,13 @@ def test_what_a_logbook_tells_shows_and_reports(caplog: pytest.LogCaptureFixture
 
 
 def opening(
-    folder: Path, backend: Any, bench: Bench | None = None, ago_s: float = 0.0, resumed: bool = True,
+    folder: Path,
+    backend: Any,
+    bench: Bench | None = None,
+    ago_s: float = 0.0,
+    resumed: bool = True,
     plant: PlantConfig | None = None,
-) -> Opening:  # fmt: skip
+) -> Opening:
     """Of a run that began so long ago, or of a new one."""
     path = folder / "journal.jsonl"
     if ago_s:

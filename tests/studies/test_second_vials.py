@@ -223,8 +223,16 @@ def test_calibration_is_told_with_its_error() -> None:
 
 
 def test_programs_announce_changes() -> None:
-    ahead = {0: (0.5, 0.3, 60), 59: (0.5, 0.3, 1), 60: (0.3, 0.7, 360), 420: (0.7, 0.7, 0), 660: (0.7, 0.3, 360),
-             1259: (0.3, 0.3, 0), 1260: (0.3, 0.5, 360), 1620: (0.5, 0.3, 60)}  # fmt: skip
+    ahead = {
+        0: (0.5, 0.3, 60),
+        59: (0.5, 0.3, 1),
+        60: (0.3, 0.7, 360),
+        420: (0.7, 0.7, 0),
+        660: (0.7, 0.3, 360),
+        1259: (0.3, 0.3, 0),
+        1260: (0.3, 0.5, 360),
+        1620: (0.5, 0.3, 60),
+    }
     assert {minute: PROGRAMS["ratio_steps"].ahead(minute) for minute in ahead} == ahead
     assert PROGRAMS["hold"].ahead(1234) == (0.5, 0.5, 0)
     assert PROGRAMS["quick"].ahead(779) == (0.6, 0.4, 1)

@@ -43,9 +43,13 @@ class SwarmConfig:
 
 
 def minimise(
-    cost: Callable[[Array], Array], low: float, high: float, start: Array, rngs: Sequence[np.random.Generator],
+    cost: Callable[[Array], Array],
+    low: float,
+    high: float,
+    start: Array,
+    rngs: Sequence[np.random.Generator],
     config: SwarmConfig,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Minimise R costs over R^H by R particle swarms with a global best (Kennedy & Eberhart 1995).
 
       v <- w v + c r1 (own best - x) + c r2 (swarm's best - x),   x <- x + v,   r1, r2 uniform per dimension

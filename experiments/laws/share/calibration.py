@@ -25,9 +25,16 @@ class SensorCalibration:
 
 
 def calibrate_sensor(
-    blank: Array, light: Array, od: Array, temperature: float, share: float = 1.0, growth: float | None = None,
-    share_sd: float = 0.0, growth_cv: float = 0.05, pair: PairConfig | None = None,
-) -> SensorCalibration:  # fmt: skip
+    blank: Array,
+    light: Array,
+    od: Array,
+    temperature: float,
+    share: float = 1.0,
+    growth: float | None = None,
+    share_sd: float = 0.0,
+    growth_cv: float = 0.05,
+    pair: PairConfig | None = None,
+) -> SensorCalibration:
     """Calibrate on medium alone, and on a culture held at one temperature and density until its pigment is in balance.
 
       o = mean(blank),   k = mean((FL - o) / OD) / L,   L = share g(T) / D + 150
