@@ -330,11 +330,7 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
         ("train", "+experiment=paper", ["experiment=paper: a recipe of benchmark"]),
         ("benchmark", "experiment=smoke", ["experiment=smoke: a recipe of train"]),
         ("deploy", "+experiment=smoke", ["experiment=smoke: a recipe of train"]),
-        (
-            "train",
-            "plant=bench",
-            ["plant=bench: train takes env, agent, experiment,", "plant= is for deploy"],
-        ),
+        ("train", "plant=bench", ["plant=bench: train takes env, agent, experiment,", "plant= is for deploy"]),
         ("benchmark", "plant=bench", ["plant=bench: benchmark takes env, experiment; plant= is for deploy"]),
         ("report", "agent=tuned", ["agent=tuned: report takes no group; agent= is for train"]),
         ("mark", "+safety=default", ["safety=default: mark takes no group; safety= is for deploy"]),

@@ -529,6 +529,21 @@ def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
     lab.reactors.stop()
 
 
+def test_a_full_disk_does_not_stand_in_the_way_of_pumps_off() -> None:
+    lab = begun(rate=0.02)
+    m = lab.reactors.measure()
+    lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+
+    def full(kind: str, fields: Any) -> None:
+        raise RecordingError("journal: No space left on device")
+
+    lab.reactors._log = full
+    with pytest.raises(RecordingError):
+        lab.reactors.measure()
+    lab.reactors.stop()
+    assert lab.motors_off()
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: int) -> None:
     rng = np.random.default_rng(seed)
