@@ -32,6 +32,7 @@ def test_phases_of_unequal_length_end_where_their_own_minutes_do():
 @pytest.mark.parametrize(("text", "fits"), [
     ("od >= 2", True), ("od <= 2.01", False), ("od >= 0", False), ("od > 0.5", False), ("od<=.3", True),
     ("od => 0.8", False), ("OD >= 0.8", False), ("od >= high", False), ("setled", False), ("time", False),
+    ("od >= 1 x", False),
 ])  # fmt: skip
 def test_a_condition_has_a_level_above_zero_and_up_to_two(text, fits):
     if fits:
