@@ -64,7 +64,7 @@ class Opening:
     resumed: bool
 
     def earlier(self) -> list[dict[str, Any]]:
-        """The rows of the run's earlier lives, none in a new run. Raises: RecordingError where they are gone."""
+        """Return the rows of the run's earlier lives, none in a new run. Raises: RecordingError where they are gone."""
         if self.resumed and not self.journal.rows:
             raise RecordingError(f"journal {self.journal.path}: missing or empty; put it back, or start a new run")
         return self.journal.rows
@@ -105,7 +105,7 @@ class Family:
     simulated = False
 
     def open(self, opening: Opening) -> AbstractContextManager[Reactor]:
-        """The reactors of a run: ready inside the context, released on leaving it. Raises, on entering: ReactorError.
+        """Open the reactors of a run: ready inside the context, released after it. Raises, on entering: ReactorError.
 
         What is dosed must be in the journal before it is done, and `Reactor.pumps_off` must say what it could not
         verify. A new run is checked first, a resumed one goes on from `opening.earlier()`.
@@ -113,7 +113,7 @@ class Family:
         raise NotImplementedError
 
     def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
-        """What a run needs, a line for each thing; opens what it needs for that and closes it. Raises: ReactorError.
+        """Check what a run needs, a line for each thing; opens and closes what that takes. Raises: ReactorError.
 
         A family that does not say how is opened as for a run; each reactor is sampled once, and its pumps are verified
         off.
@@ -175,7 +175,7 @@ class Family:
         """Whether each spare pump that a scenario gives by has a tube, and can give `most_ml`. Raises: UnfitError."""
 
     def coculture(self, backend: Any, pair: str) -> Any:
-        """The config with vials of two species, where it simulates vials that were left as they are. pair: which."""
+        """Put vials of two species into a config that simulates vials that were left as they are. pair: which."""
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
@@ -187,15 +187,15 @@ class Family:
         return False
 
     def seeing_fluorescence(self, backend: Any) -> Any:
-        """The config by which fluorescence is measured."""
+        """Return the config by which fluorescence is measured."""
         return backend
 
     def rim_ml(self, volumes_ml: Array) -> Array | float:
-        """What a vial holds, mL, inf where that is not known. Args: volumes_ml: of the cultures, (N,)."""
+        """Return what a vial holds, mL, inf where that is not known. Args: volumes_ml: of the cultures, (N,)."""
         return math.inf
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """The vials themselves, where the program knows them, and the flow that their pump is believed to have, mL/s.
+        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s.
 
         Args: reactors: as opened.
         """
@@ -206,16 +206,16 @@ class Family:
         return str(getattr(backend, "url", "")) or "address not said"
 
     def start_od(self, backend: Any, plant: PlantConfig) -> float:
-        """The OD that cultures start from, as far as it is known beforehand; else 0."""
+        """Return the OD that cultures start from, as far as it is known beforehand; else 0."""
         return 0.0
 
     def unmeasured(self, backend: Any) -> str:
-        """What was not measured on the bench and is assumed, in a line; "" for nothing. Raises: UnfitError."""
+        """List what was not measured on the bench and is assumed, in a line; "" for nothing. Raises: UnfitError."""
         return ""
 
 
 def _looked_at(reactors: Reactor) -> Iterator[Check]:
-    """A sample of each reactor, and its pumps off. Raises: ReactorError."""
+    """Take a sample of each reactor, and verify its pumps off. Raises: ReactorError."""
     n = len(reactors.names)
     yield Check("reactors", True, f"{', '.join(reactors.names)} opened")
     try:
@@ -257,12 +257,12 @@ _loaded: dict[str, Family] = {}
 
 
 def known() -> list[str]:
-    """The name of every kind."""
+    """List the name of every kind."""
     return list(dict.fromkeys([*SHIPPED, *_loaded]))
 
 
 def family(kind: str) -> Family:
-    """The family of this name. Raises: ValueError naming those there are."""
+    """Return the family of this name. Raises: ValueError naming those there are."""
     if kind not in known():
         raise ValueError(f"backend.kind = {kind}: allowed {', '.join(known())}")
     if kind not in _loaded:
@@ -271,7 +271,7 @@ def family(kind: str) -> Family:
 
 
 def family_of(backend: Any) -> Family:
-    """The family that a backend's config is of."""
+    """Return the family that a backend's config is of."""
     return family(backend.kind)
 
 

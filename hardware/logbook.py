@@ -15,7 +15,7 @@ screen = logging.getLogger(__name__)
 
 
 def no_log(kind: str, fields: Mapping[str, Any]) -> None:
-    """Keeps nothing."""
+    """Keep nothing."""
 
 
 class Logbook:

@@ -145,7 +145,7 @@ class Stations(Generic[S, H]):
     # ------------------------------------------------------------------------------------------------- measurement
 
     def measure(self) -> Measurement:
-        """The newest samples; waits for one, doing what is due meanwhile.
+        """Return the newest samples; wait for one, doing what is due meanwhile.
 
         Returns with none fresh when a fault appears or disappears, and when no reactor has had a sample for `stale_s`
         (again every 20 s while that lasts): `vitals` then says what is wrong.
@@ -167,7 +167,7 @@ class Stations(Generic[S, H]):
             self._wait(min([deadline, *(station.next_look for station in self.stations)]) - now)
 
     def _between(self) -> None:
-        """What is due between two reactors."""
+        """Do what is due between two reactors."""
 
     def _wait(self, longest_s: float) -> None:
         """Wait a little, not longer than `longest_s`."""
@@ -212,7 +212,7 @@ class Stations(Generic[S, H]):
         return Receipt(volume, notes, waste, kept)
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """What was given beyond what was booked when doses began, not told before: run time, s, and volumes."""
+        """Return what was given beyond what was booked when doses began, not told before: run time, s, and volumes."""
         found = []
         for i, station in enumerate(self.stations):
             mine = np.arange(len(self.stations)) == i
@@ -248,7 +248,7 @@ class Stations(Generic[S, H]):
         return self._lines(self._all(chosen, action))
 
     def _lines(self, failed: Mapping[S, ReactorError]) -> list[str]:
-        """What failed, in the order of the reactors."""
+        """List what failed, in the order of the reactors."""
         return [f"{station.name}: {failed[station]}" for station in self.stations if station in failed]
 
     def _all(self, stations: Sequence[S], action: Callable[[S], Any]) -> dict[S, ReactorError]:
@@ -262,7 +262,7 @@ class Stations(Generic[S, H]):
         return failed
 
     def _not_off(self, failed: str) -> str:
-        """What is said of pumps that could not be verified off."""
+        """Word the report of pumps that could not be verified off."""
         return failed
 
     def stop(self) -> None:
@@ -282,7 +282,7 @@ class Stations(Generic[S, H]):
     # ----------------------------------------------------------------------------------------------------- journal
 
     def raise_late(self) -> None:
-        """Raises: what the log raised where it must not stand in the way of a pump-off; once."""
+        """Raise what the log raised where it must not stand in the way of a pump-off; once."""
         error, self._log_error = self._log_error, None
         if error is not None:
             raise error

@@ -189,21 +189,21 @@ class ClosedLoop:
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
 
     def _book_repeats(self) -> None:
-        """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
+        """Book what the devices dosed by themselves at its own time, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
             self.book(receipt, at_s)
             self.supply.given(np.full(len(self.done), receipt.pump), receipt.volume_ml)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
     def book(self, receipt: Receipt, at_s: float) -> None:
-        """What was dosed counts for the interlock, and for every signal. Args: at_s: run time, s."""
+        """Book a dose with the interlock and every signal. Args: at_s: run time, s."""
         self.interlock.confirm(receipt, at_s)
         kept_ml = np.zeros(len(self.done)) if receipt.kept_ml is None else receipt.kept_ml
         for signal in self.signals:
             signal.dosed(receipt.volume_ml, kept_ml)
 
     def set_level(self, name: str, level_ml: float) -> float:
-        """The ledger of a vial, and the device's own where it keeps one, set to what was read; what it was, mL."""
+        """Set the ledger of a vial, and the device's own, to a level that was read; return the old level, mL."""
         n, ledger = self.reactors.names.index(name), self.interlock.budget.volume_ml
         before, ledger[n] = float(ledger[n]), level_ml
         if isinstance(self.reactors, KeepsLevels):
@@ -211,14 +211,14 @@ class ClosedLoop:
         return before
 
     def counted(self, name: str, share: float, sd: float, minute: float) -> Answer:
-        """A share that was counted in a sample of a reactor, drawn at a minute of the run; what came of it."""
+        """Take a share counted in a sample of a reactor, drawn at a minute of the run; return what came of it."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 return signal.counted(self.reactors.names.index(name), share, sd, minute)
         return "left out: nothing here estimates it", True
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count]) -> None:
-        """Recordings of the run's earlier lives, and the shares that were counted, to whoever estimates with them."""
+        """Replay recordings of the run's earlier lives, and counted shares, to every estimator that uses them."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))
@@ -245,7 +245,7 @@ class ClosedLoop:
         return failed
 
     def position(self, n: int) -> dict[str, Any]:
-        """What a decision for reactor n has to keep of where its schedule stands; plain numbers."""
+        """Return what a decision for reactor n keeps of the position in its schedule; plain numbers."""
         return {"began": float(self.began[n]), **memory.row(self.progress, n), **memory.row(self.supply, n)}
 
     def state(self) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class ShareWarnings:
 
 
 def program_of(schedule: Scenario) -> Program:
-    """What a schedule asks for of the share."""
+    """Return the program of the share in a schedule."""
     if schedule.ratio_sine:
         mean, amplitude, period = schedule.ratio_sine
         return Program((), schedule.minutes, (mean, amplitude, period))
@@ -144,7 +144,7 @@ class Share:
         return Findings(found, why, self._warned(found, goal, inside, sample.minute, sample.believed))
 
     def wanted(self, elapsed: Array) -> Wanted:
-        """What each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
+        """Return what each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
         each = [
             program.wanted(elapsed[i : i + 1], schedule.announce_min)
             for i, (program, schedule) in enumerate(zip(self._programs, self.schedules, strict=True))
@@ -155,7 +155,7 @@ class Share:
     def _warned(
         self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask
     ) -> list[str | None]:
-        """What is out of control in each believed row, None elsewhere.
+        """Warn of what is out of control in each used row, None elsewhere.
 
         Args: goal: the share that is announced, else the one asked for, (N,). inside: targets that are at no limit.
         """

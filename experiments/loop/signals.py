@@ -71,7 +71,7 @@ class Sample:
         cls, m: Measurement, interlock: Interlock, rows: Mask, believed: Mask, elapsed: Array, phase: NDArray[np.intp],
         setpoint: Array, temperature: Array,
     ) -> "Sample":  # fmt: skip
-        """A measurement with what the interlock says of its light and of targets; the others as they are."""
+        """Build a sample: a measurement with what the interlock says of its light and of targets."""
         light, safety = interlock.fluorescence(m), interlock.config
         light = np.full(m.od.shape, np.nan) if light is None else light
         limits = safety.composition_low, safety.composition_high
@@ -115,7 +115,7 @@ class Signal(Protocol):
         ...
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """What is told of the sample. Args: given: what the actuator was told, in the unit of `decide`, (N,)."""
+        """Report on the sample. Args: given: the command to the actuator, in the unit of `decide`, (N,)."""
         ...
 
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
@@ -140,11 +140,11 @@ class Counted(Protocol):
     """A signal that learns from samples which somebody counted."""
 
     def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
-        """A share of reactor n at a minute of the run, with its sd; what came of it."""
+        """Take a share of reactor n at a minute of the run, with its sd; return what came of it."""
         ...
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """What earlier lives of the run recorded: columns of each reactor, and every sample.
+        """Replay what earlier lives of the run recorded: columns of each reactor, and every sample.
 
         Args: light: lowest and highest believed counts of fluorescence.
         """
@@ -237,14 +237,14 @@ def add(name: str, make: Make) -> None:
 
 
 def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
-    """A signal of one's own. Raises: ValueError naming the signals there are, or what does not fit."""
+    """Build a signal of an extension. Raises: ValueError naming the signals there are, or what does not fit."""
     if name not in MAKERS:
         raise ValueError(f"signals.{name}: no such signal; allowed {', '.join(MAKERS) or 'those of extend=FILE.py'}")
     return MAKERS[name](config, schedules)
 
 
 def one_each(signals: Sequence[Signal]) -> list[Signal]:
-    """The signals, no two of which share an actuator. Raises: ValueError naming both."""
+    """Check that no two signals share an actuator; return them. Raises: ValueError naming both."""
     for k, signal in enumerate(signals):
         for other in signals[:k]:
             if signal.actuator == other.actuator:

@@ -65,6 +65,6 @@ class Supply:
         return np.where(given, np.array(PUMPS)[largest], FEED_PUMP).astype(np.intp), dose
 
     def given(self, pump: NDArray[np.intp], ml: Array) -> None:
-        """What was begun by each reactor's pump, mL, (N,)."""
+        """Book what was begun by each reactor's pump, mL, (N,)."""
         for k, spare in enumerate(PUMPS):
             self.owed_ml[:, k] -= np.where(pump == spare, ml, 0.0)

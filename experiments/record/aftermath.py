@@ -47,7 +47,7 @@ class Believed:
 
 
 def believed(run: Path) -> Believed:
-    """The model of the policy, else of the `env_file`, else the nominal one, in a deployment's folder."""
+    """Load the model of the policy, else of the `env_file`, else the nominal one, of a deployment's folder."""
     config = _config(run)
     nominal = EnvConfig(tau=_bench(config).tau)
     controller = config.get("controller")
@@ -84,7 +84,7 @@ def _config(run: Path) -> Mapping[str, Any]:
 
 
 def decisions(run: Path, reactor: str) -> dict[str, Array]:
-    """What the journal says of each decision for a reactor: `minute`, `supervised` and the controller's estimates.
+    """Read each decision for a reactor from the journal: `minute`, `supervised` and the controller's estimates.
 
     A key that no decision has is left out; one that some lack is nan there. All of shape (K,).
     """
@@ -173,7 +173,7 @@ def _facts(found: Agreement) -> list[str]:
 
 
 def _fact(c: Compared) -> str:
-    """The last estimate against the model's value, and how the estimates drift."""
+    """Compare the last estimate with the model's value, and say how the estimates drift."""
     if c.latest is None:
         return "not identifiable"
     last = f"last {_shown(c.latest)}, the model's {number(c.expected)}"
@@ -199,7 +199,7 @@ def _sure(why: Mapping[str, Array]) -> list[str]:
 
 
 def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
-    """What the interlock and a supervisor did."""
+    """Say what the interlock and a supervisor did."""
     supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
     reasons = summary.get("reasons")
     kinds = "; ".join(

@@ -80,7 +80,7 @@ class Curves:
             self._last = minute
 
     def end(self, summary: Mapping[str, Any], row: Mapping[str, float | str], pictures: Mapping[str, Path]) -> None:
-        """What came out: figures, the windows as a table, and a row of the HPARAMS table.
+        """Write the results: figures, the windows as a table, and a row of the HPARAMS table.
 
         Args: summary: content of summary.json. row: that row but its results. pictures: name -> PNG.
         """
@@ -104,7 +104,7 @@ class Curves:
 
 
 def _results(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The tags of a deployment's results, nan where there is none."""
+    """Return the tags of a deployment's results, nan where there is none."""
 
     def known(key: str) -> Array:
         values = [w.get(key) for w in summary["windows"]]
@@ -120,7 +120,7 @@ def _results(summary: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """The windows in Markdown."""
+    """Format the windows in Markdown."""
     columns = [key for key in WINDOW if any(key in w for w in windows)]
     rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in columns] for w in windows]
     return tables.markdown([WINDOW[key] for key in columns], rows)

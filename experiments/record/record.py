@@ -101,7 +101,7 @@ class Record:
                 self.rows[n] = read_rows(self._paths[n], self.columns)
 
     def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[str]:
-        """What was completed from the rows of the journal, one line each."""
+        """Complete recordings from the rows of the journal; return a line for each."""
         lines = []
         for n, name in enumerate(self.names):
             lines += complete(journal, name, self.rows[n], partial(self._write, n))
@@ -140,7 +140,7 @@ class Record:
         files.write_json(self.state_path, content, self._fsync, indent=None)
 
     def series(self, column: str) -> Array:
-        """A column of all recordings, shape (N, K); shorter recordings end in nan."""
+        """Return a column of all recordings, shape (N, K); shorter recordings end in nan."""
         values = np.full((len(self.names), max(map(len, self.rows), default=0)), np.nan)
         for own, rows in zip(values, self.rows, strict=True):
             own[: len(rows)] = rows.columns[column]

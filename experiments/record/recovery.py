@@ -43,7 +43,7 @@ KEPT = ("decision", "closed")  # rows of the journal that say what is in a row o
 
 
 def row_of(step: Step, n: int) -> Row:
-    """The CSV row of reactor n in a step."""
+    """Build the CSV row of reactor n in a step."""
     further = {key: float(value[n]) for key, value in step.columns.items()}
     return {
         "time_min": round(float(step.minute[n]), 4),
@@ -100,12 +100,12 @@ class Rows:
             reason.rows, reason.last_min = reason.rows + 1, minute
 
     def last(self) -> dict[str, float]:
-        """The numbers of the newest row; none for an empty recording."""
+        """Return the numbers of the newest row; none for an empty recording."""
         return {key: column[-1] for key, column in self.columns.items()} if len(self) else {}
 
 
 def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
-    """The rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
+    """Read the rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
     found = Rows(columns)
     try:
         file = open(path, newline="", encoding="utf-8")  # noqa: SIM115 (closed below)
@@ -141,7 +141,7 @@ def complete(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write:
 
 
 def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
-    """mL that belong to each decision for a reactor, by its row of the journal, oldest first.
+    """Sum the mL of each decision for a reactor, by its row of the journal, oldest first.
 
     A dose belongs to the decision before it, its repetitions to the next one, or at the end of a life of the run to the
     last one (`closed`). Raises: RecordingError.
@@ -158,7 +158,7 @@ def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]
 
 
 def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
-    """The last row of reactor `name` as it should be, if its dose was cut short or repeated after it; else None.
+    """Correct the last row of reactor `name`, if its dose was cut short or repeated after it; else None.
 
     Args: journal: up to the end of this life of the run, with a row `closed`. rows: as written, with the dose as it was
       planned. Raises: RecordingError.
@@ -195,7 +195,7 @@ def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> I
 
 
 def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
-    """The row of a sample after which the program was killed before it decided: no dose.
+    """Build the row of a sample after which the program was killed before it decided: no dose.
 
     Args: rows: those before it.
     """
@@ -214,7 +214,7 @@ def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
 
 
 def load_state(path: Path) -> dict[str, Any]:
-    """The content of state.json; `journal_row` is the first row of the journal that it does not know of.
+    """Load state.json; `journal_row` is the first row of the journal that it does not include.
 
     Raises: RecordingError where there is none to resume from.
     """
@@ -283,7 +283,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
 
 
 def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: list[str]) -> dict[str, Any]:
-    """The state with every schedule where the newest decision left it that the state does not know of."""
+    """Advance every schedule of a state to the newest decision that the state does not include."""
     found = dict(state)
     for row in rows:
         if row["kind"] == "decision" and isinstance(row.get("position"), Mapping) and row.get("reactor") in names:
@@ -295,6 +295,6 @@ def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: 
 
 
 def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:
-    """What the driver last put off to the next dose by these rows of a journal, mL, (N,)."""
+    """Return what the driver last put off to the next dose by these rows of a journal, mL, (N,)."""
     last = {row["reactor"]: float(row["carry_ml"]) for row in rows if row["kind"] == "intent"}
     return np.array([last.get(name, 0.0) for name in loop.reactors.names])

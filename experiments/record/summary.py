@@ -129,7 +129,7 @@ class ChangeLog:
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """A head and one line per window of a summary."""
+    """Format a head and one line per window of a summary."""
     heads = ("setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
     lines = [f"{'reactor':8} " + " ".join(f"{head:>8}" for head in heads)]
     for w in windows:
@@ -143,7 +143,7 @@ def _cell(value: float) -> str:
 
 
 def reasons_line(rows: Rows) -> str:
-    """What the interlock said in a run, most frequent first; "" if it had nothing to say."""
+    """List what the interlock said in a run, most frequent first; "" if it had nothing to say."""
     often = sorted(rows.reasons.items(), key=lambda item: -item[1].rows)
     return "; ".join(f"{kind} in {t.rows} of {len(rows)} rows, {span(t.first_min, t.last_min)}" for kind, t in often)
 
@@ -222,7 +222,7 @@ def _further(table: Table, n: int, start: float, end: float) -> dict[str, Any]:
 
 
 def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """A head and one line per window in which a share was asked for; "" if there is none."""
+    """Format a head and one line per window in which a share was asked for; "" if there is none."""
     keys = {"asked": "ratio_setpoint", "mean |e|": "ratio_abs_error_mean", "last 2 h": "ratio_abs_error_last2h"}
     keys |= {"true |e|": "true_ratio_abs_error_mean", "OD |e|": "od_abs_error_mean"}
     kept = [w for w in windows if np.isfinite(w.get("ratio_abs_error_mean", np.nan))]
@@ -236,7 +236,7 @@ def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _setpoint(table: Table) -> Array:
-    """What was asked of the OD, nan in a recovery, which asks for nothing; (N, K)."""
+    """Return the setpoint of the OD, nan in a recovery, which has none; (N, K)."""
     return np.where(table.columns["phase"] >= 0, table.columns["setpoint"], np.nan)
 
 

@@ -75,7 +75,7 @@ class Connection:
         return None if found is None else found.get(self.name, {})
 
     def read(self, tries: int = 3) -> DeviceState:
-        """The reactor's state, certainly its own.
+        """Read the reactor's state, certainly its own.
 
         Raises: LinkError, ProtocolError; DeviceStateError if it is absent or another client keeps selecting reactors;
           IdentityError if another unit answers at this position than before.
@@ -102,7 +102,7 @@ class Connection:
         return state
 
     def _look(self) -> DeviceState:
-        """The state of whichever reactor is selected, which tells of all whether they are present.
+        """Read the state of the selected reactor, which tells of all whether they are present.
 
         Raises: LinkError, ProtocolError; DeviceStateError if this one is absent.
         """
@@ -179,7 +179,7 @@ class Connection:
         self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
 
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """These pumps off, verified. Each one is tried even if another one fails, unless nothing answers at all.
+        """Switch these pumps off, verified. Each is tried even if another one fails, unless nothing answers at all.
 
         The waste pump goes off last, after every feed pump was heard to: where one may run, it runs too.
 
@@ -240,7 +240,7 @@ class Connection:
         self.post(f"/MeasureTemp/IR/{self.name}")
 
     def escalate(self) -> None:
-        """A pump stays on: end the experiment, which switches everything off, then touch the bus."""
+        """End the experiment where a pump stays on, which switches everything off, then touch the bus."""
         for path in (f"/Experiment/0/{self.name}", f"/MeasureTemp/IR/{self.name}"):
             try:
                 self.post(path)

@@ -15,7 +15,7 @@ def diagnose(
     state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
     dosing: bool, stuck: str, ended: str, overflow_trouble: str, late: str = "",
 ) -> Fault | None:  # fmt: skip
-    """The gravest fault that a verified state shows, against how the reactor should be found.
+    """Find the gravest fault that a verified state shows, against how the reactor should be found.
 
     Args:
       age_s: of the newest sample, s. start_time: of its experiment. blank: counts.
@@ -60,7 +60,7 @@ def diagnose(
 
 
 def fault_of(error: ReactorError, present: bool) -> Fault:
-    """What an error of a request or a read means; `present`: the reactor was there when it was last looked at."""
+    """Translate an error of a request or a read; `present`: the reactor was there when it was last looked at."""
     if isinstance(error, IdentityError):
         return Fault("identity", str(error), "reactors were exchanged: start a new run")
     if not isinstance(error, DeviceStateError):

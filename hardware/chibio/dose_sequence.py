@@ -75,7 +75,7 @@ class DoseSequence:
         return self._given_up[-1].feed_pump if self._given_up else ""
 
     def forget_sample(self) -> None:
-        """The device's records begin anew: no dose was decided for any sample in them."""
+        """Forget the last sample: the device's records begin anew, and no dose was decided for any of them."""
         self._acted = None
 
     def begin(
@@ -109,7 +109,7 @@ class DoseSequence:
         return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
 
     def _plan(self, rate: float, pump: str) -> DosePlan:
-        """The dose by a pump; every pump but the feed has its declared flow and starts without a carry."""
+        """Plan the dose by a pump; every pump but the feed has its declared flow and starts without a carry."""
         if pump == FEED:
             return plan_dose(rate, self._carry_ml, self._doses, self._calibration, self._config.dosing)
         if pump not in self._config.supply.pumps:
@@ -250,7 +250,7 @@ class DoseSequence:
         self._off_s = self._book.elapsed()
 
     def _in_doubt(self) -> None:
-        """A request of a dose was not answered: from the last answer on the device may have done otherwise."""
+        """Note that a request was not answered: from the last answer on the device may have done otherwise."""
         if math.isnan(self._doubt_s):
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
@@ -282,7 +282,7 @@ class DoseSequence:
             self._book.log("found", **added)
 
     def _conclude(self, known: ReactorHistory) -> None:
-        """A dose is over: on record; what it gave beyond what was booked when it began waits to be booked."""
+        """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
         pump = self._calibrated(known.feed_pump)
         ending, note = conclude(known, self._book.elapsed(), pump, self._calibration.waste)
         if note:
@@ -295,7 +295,7 @@ class DoseSequence:
         self._unanswered = False
 
     def _book_late(self, lost: ReactorHistory) -> None:
-        """A feed command that was given up was carried out once the pumps were verified off: on record, and booked."""
+        """Record and book a feed command that was given up and carried out after the pumps were verified off."""
         again = replace(lost, open=True, on_s=self._off_s, wasted=False, feed_on=NEVER, feed_off=NEVER)
         ending, _ = conclude(again, self._book.elapsed(), self._calibrated(lost.feed_pump), self._calibration.waste)
         given = ending.beyond(0.0)

@@ -63,7 +63,7 @@ class PumpCalibration:
         return max(volume_ml / self.flow_ml_s - self.bias_s, 0.0)
 
     def volume(self, on_s: float) -> float:
-        """mL that `on_s` seconds deliver; not below 0."""
+        """Return the mL that `on_s` seconds deliver; not below 0."""
         return max(self.flow_ml_s * (on_s + self.bias_s), 0.0) if on_s > 0.0 else 0.0
 
     @property
@@ -77,7 +77,7 @@ class PumpCalibration:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PumpCalibration:
-        """The inverse of `as_dict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
+        """Invert `as_dict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
 
         A file may hold more than this, for instance the weighings it rests on.
         """
@@ -153,7 +153,7 @@ class SupplyConfig:
         return {"Pump3": self.pump3_ml_s, "Pump4": self.pump4_ml_s}.get(pump, 0.0)
 
     def most_ml(self, pump: str) -> float:
-        """The largest dose of a spare pump, mL."""
+        """Return the largest dose of a spare pump, mL."""
         return self.calibration(pump).volume(PERIOD_S * MAX_FEED_DUTY)
 
     @property
@@ -192,7 +192,7 @@ class DosePlan:
 def plan_dose(
     rate: float, carry_ml: float, doses: int, calibration: ReactorCalibration, config: DosingConfig
 ) -> DosePlan:
-    """The dose that brings `rate` over one control period, together with what earlier periods left over.
+    """Plan the dose that brings `rate` over one control period, together with what earlier periods left over.
 
     feed duty = (v / q - bias) / 63 with v = rate * period + carry; nothing is dosed while v is below the smallest dose,
     v is then the new carry. So the mean flow is right even for rates whose single doses the pump cannot deliver, and

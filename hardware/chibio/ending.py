@@ -22,9 +22,12 @@ MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period i
 
 @dataclass(frozen=True)
 class _Pump:
-    """One pump in an open dose. asked_s: run time at which it was asked on, inf if it never was. on, off: run times
-    between which it went on and off, nan if not known. tried_s: run time at which it was first asked off in vain, nan
-    if it never was. dose_s: on-time as planned."""
+    """One pump in an open dose.
+
+    asked_s: run time at which it was asked on, inf if it never was. on, off: run times between which it went on and
+    off, nan if not known. tried_s: run time at which it was first asked off in vain, nan if it never was. dose_s:
+    on-time as planned.
+    """
 
     part: str
     name: str
@@ -58,7 +61,7 @@ def found(
     known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float, silence_s: float,
     stopped: Mapping[str, float] | None,
 ) -> dict[str, Span | None]:  # fmt: skip
-    """What a look at the device adds to what is `known` of an open dose: when its pumps went on or off, run times.
+    """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
 
     None takes back what was answered and is not so. Nothing is added where the answers have told it. A pump that is
     found off was switched off by whom and when, in this order: by a restart; by the agent, as it says; by a command of
@@ -124,14 +127,14 @@ def conclude(
 
 
 def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) -> tuple[float, int, float]:
-    """What a pump gives that is on for so long: its dose, mL, how often it began again, what the last of those gave."""
+    """Return what a pump gives that is on for so long: its dose, mL, its repeats, and what the last repeat gave."""
     times = int(on_s // period_s)
     last_ml = pump.volume(min(dose_s, on_s - times * period_s)) if times else 0.0
     return pump.volume(min(dose_s, on_s)), times, last_ml
 
 
 def _words(ending: Ending, planned_ml: float) -> str:
-    """What is not as planned."""
+    """Say what is not as planned."""
     low_ml, most_ml, times = ending.feed_low_ml, ending.feed_ml + ending.repeated_ml, ending.feed_times
     dose, volume = f"a dose of {planned_ml:.2f} mL", f"{low_ml:.2f} to {most_ml:.2f} mL"
     if times:

@@ -29,7 +29,7 @@ Link = tuple[Transport, Clock]
 
 @contextmanager
 def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
-    """The open link to a device that no other client has, and the device's clock.
+    """Open the link to a device that no other client has, and the device's clock.
 
     Args: own_url: of a device that was started for this run alone, in the place of the config's.
     Raises: ReactorError if nothing answers, or another client on this computer has the device, by whatever name.
@@ -52,7 +52,7 @@ class ChiBioFamily(Family):
     called = "the Chi.Bio"
 
     def linked(self, backend: ChiBioConfig, bench: Bench) -> AbstractContextManager[Link]:
-        """The device of a config: its link and its clock. Raises: ReactorError."""
+        """Open the device of a config: its link and its clock. Raises: ReactorError."""
         return linked(backend)
 
     @contextmanager

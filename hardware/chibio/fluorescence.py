@@ -45,11 +45,11 @@ class FluorescenceSlotConfig:
         return f"/SetFPMeasurement/{'/'.join(settings)}" if self.measure else ""
 
     def own(self, state: DeviceState) -> Slot | None:
-        """The configured slot; None if the device does not show it, or it is on without its settings."""
+        """Return the configured slot; None if the device does not show it, or it is on without its settings."""
         return next((s for s in state.slots if s.name == self.slot and (s.led or not s.on)), None)
 
     def wrong(self, state: DeviceState) -> str:
-        """What a read shows of the slot that is not as it must be; "" if all is well or nothing is measured."""
+        """Say what is wrong with the slot in a read; "" if all is well or nothing is measured."""
         if not self.measure:
             return ""
         slot = self.own(state)
@@ -61,7 +61,7 @@ class FluorescenceSlotConfig:
         return "" if found == (self.led, self.base_band, self.band, self.gain) else f"set to {', '.join(found)}"
 
     def others_on(self, state: DeviceState) -> tuple[str, ...]:
-        """The modes that are on beside the slot that this run uses."""
+        """List the modes that are on beside the slot that this run uses."""
         return tuple(m for m in state.modes if not (self.measure and m == self.slot))
 
 
@@ -100,7 +100,7 @@ class Fluorescence:
         return state, self._config.wrong(state)
 
     def reading(self, state: DeviceState) -> float:
-        """Counts of the band in the newest sample, base times emission; nan where there are none.
+        """Return counts of the band in the newest sample, base times emission; nan where there are none.
 
         Args: state: that brought the sample.
         """

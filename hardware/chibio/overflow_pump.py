@@ -49,7 +49,7 @@ class OverflowPumpConfig:
         return self.duty * self.flow_ml_s if self.pump else 0.0
 
     def wrong(self, state: DeviceState) -> str:
-        """What a read shows of it that is not as it must be; "" if all is well, or there is none."""
+        """Say what is wrong with the overflow pump in a read; "" if all is well, or there is none."""
         if not self.pump:
             return ""
         k = PUMPS.index(self.pump)

@@ -98,7 +98,7 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
 
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration], room_ml: float) -> Check:
-    """What the overflow pump covers; without one, what cannot be prevented.
+    """Check what the overflow pump covers; without one, what cannot be prevented.
 
     Args: room_ml: above the fullest culture.
     """
@@ -141,7 +141,7 @@ def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig)
 
 
 def _reactor(name: str, state: DeviceState, calibration: ReactorCalibration, config: ChiBioConfig) -> Iterator[Check]:
-    """Checks of one reactor's state."""
+    """Check one reactor's state."""
     blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
     source = "stored" if math.isfinite(calibration.blank) else "of the device"
     yield Check(

@@ -194,7 +194,7 @@ def _last(data: Any, group: str) -> float:
 
 
 def _terminal(data: Any) -> str:
-    """The newest line of the text log; some forks keep a list instead of a text."""
+    """Return the newest line of the text log; some forks keep a list instead of a text."""
     text = data.get("Terminal", {})
     text = text.get("text", "") if isinstance(text, dict) else ""
     if isinstance(text, list):
@@ -208,7 +208,7 @@ def _modes(data: Any) -> tuple[str, ...]:
 
 
 def _slot(data: Any, name: str) -> Slot:
-    """A slot; settings are empty and values nan where it is off, or left out by an older agent on the board."""
+    """Parse a slot; settings are empty and values nan where it is off, or left out by an older agent on the board."""
     on, entry = _flag(data, name, "ON"), _get(data, name)
     if not (on and "LED" in entry):
         return Slot(name, on)
@@ -217,7 +217,7 @@ def _slot(data: Any, name: str) -> Slot:
 
 
 def parse_state(body: bytes) -> DeviceState:
-    """The state out of an answer to GET /getSysdata/; unknown fields are ignored, NaN is accepted in readings.
+    """Parse the answer to GET /getSysdata/; unknown fields are ignored, NaN is accepted in readings.
 
     Raises: ProtocolError naming the first field that is missing or malformed.
     """
@@ -280,7 +280,7 @@ class Permitted:
 
 
 def check_command(path: str, permitted: Permitted) -> None:
-    """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
+    """Check a command before the wire: only these POSTs, only for these reactors, only within these limits.
 
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
     Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow

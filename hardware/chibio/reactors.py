@@ -192,7 +192,7 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         super().note_down(kind, self._remember(kind, fields))
 
     def _remember(self, kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """What a row says is what a resumed run would know; the row."""
+        """Remember what a row says, as a resumed run would; return the row."""
         row = {"time_s": round(self.elapsed(), 3), **fields}
         if (name := str(row.get("reactor"))) in self._past:
             self._past[name] = self._past[name].after({"kind": kind, **row})

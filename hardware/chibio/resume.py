@@ -51,7 +51,7 @@ class ReactorHistory(History):
     KEYS: ClassVar = {**History.KEYS, "device_id": str, "blank": float, "start_time": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """What is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
+        """Return what is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
         kind, known = row["kind"], super().after(row)
         if kind == "intent":
             feed_s, waste_s = (PERIOD_S * float(row[f"{part}_duty"]) for part in ("feed", "waste"))
@@ -74,7 +74,7 @@ class ReactorHistory(History):
         return replace(known, overflow_pump_on=True) if kind == "guard" else known
 
     def _switched(self, path: str, answer: int | str, at_s: float, took_s: float) -> Self:
-        """A pump was switched in an open dose; the first answer of its kind counts, a refusal does not."""
+        """Note a pump switched in an open dose; the first answer of its kind counts, a refusal does not."""
         known = replace(self, wasted=self.wasted or path.startswith(f"/SetOutputOn/{WASTE}/1/"))
         for part, pump in (("feed", known.feed_pump), ("waste", WASTE)):
             for force, word in ((1, "on"), (0, "off")):
@@ -94,5 +94,5 @@ def _span(said: Any) -> Span:
 
 
 def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
-    """What the journal of a run says of each reactor. Args: rows: oldest first. Raises: RecordingError."""
+    """Replay the journal of a run for each reactor. Args: rows: oldest first. Raises: RecordingError."""
     return replayed(rows, ReactorHistory())

@@ -46,7 +46,7 @@ class Sampling:
         self._offsets.clear()
 
     def expect_first(self) -> None:
-        """The device's own time begins now, and so does its first cycle."""
+        """Expect the first cycle: the device's own time begins now."""
         self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
 
     def wait_from_now(self) -> None:
@@ -68,7 +68,7 @@ class Sampling:
         )
 
     def not_taken(self, is_new: bool) -> None:
-        """A look ended without a sample to act on: there was none, or a new one that a fault forbids to use."""
+        """Note a look without a sample to act on: there was none, or a new one that a fault forbids to use."""
         self._looked = not is_new
 
     def take(self, state: DeviceState, now: float) -> str:

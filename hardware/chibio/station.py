@@ -243,7 +243,7 @@ class Station:
         return False if self.busy else self._judge(state)
 
     def _take_over_later(self) -> bool:
-        """The memory of an earlier life could not be taken over at the start; no sample yet. Raises: ReactorError."""
+        """Take over the memory of an earlier life that could not be taken at the start. Raises: ReactorError."""
         if not self.busy:
             self.restore()
             self.busy = True
@@ -255,7 +255,7 @@ class Station:
         return self.fluorescence.keep_on(self.overflow_pump.keep_on(state))
 
     def _judge(self, state: DeviceState) -> bool:
-        """What a verified state means; True if it brings a new sample."""
+        """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
         is_new = self.sampling.look(state, now)
         age = 0.0 if is_new else now - self.sampling.arrived_s

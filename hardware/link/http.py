@@ -39,7 +39,7 @@ TOKEN = "give backend.transport.token_file a copy of the board's (docs/board_age
 
 @contextlib.contextmanager
 def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]:
-    """A trace for a request that is cut off after `wait_s`, or by a stop; httpx's own time-out begins anew per byte.
+    """Cut a request off after `wait_s`, or by a stop; httpx's own time-out begins anew per byte.
 
     What a signal's handler raises comes after the request. In the middle it would leave a lock or the place of the
     connection taken for good, and no pump could be switched off.
@@ -159,7 +159,7 @@ class HttpTransport(Transport):
                 self.post("/_agent/bye")
 
     def switched_off(self) -> SwitchedOff | None:
-        """What the agent, if there is one, has switched off. Raises: LinkError, ProtocolError."""
+        """Ask the agent, if there is one, what it has switched off. Raises: LinkError, ProtocolError."""
         return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 
     def close(self) -> None:

@@ -82,7 +82,7 @@ class MqttLink:
             self._client.publish(topic, payload, qos=1)
 
     def keep(self, payload: str) -> None:
-        """The retained message on `will`, as long as we are there."""
+        """Keep a retained message on `will`, as long as we are there."""
         self._kept = payload
         self._client.publish(self._will, payload, qos=1, retain=True)
 

@@ -59,7 +59,7 @@ class DeviceLock:
 
 @contextmanager
 def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Iterator[Transport]:
-    """The configured link, owned exclusively on this computer as long as it is open.
+    """Open the configured link, owned exclusively on this computer as long as it is open.
 
     Raises: ValueError for a malformed address, LinkError if a serial line cannot be opened, its agent does not answer
       or the token of an agent cannot be read, DeviceStateError if another process holds the device.

@@ -43,19 +43,19 @@ class ReplyHeader:
 
 
 def encode_request(number: int, method: str, path: str) -> bytes:
-    """A request line with its newline."""
+    """Encode a request line with its newline."""
     head = f">{number} {method} {path}".encode("ascii")
     return head + b" %08x\n" % zlib.crc32(head)
 
 
 def decode_header(line: bytes) -> ReplyHeader | None:
-    """The header at the end of a line without its newline, whatever stands before it; None if there is none."""
+    """Decode the header at the end of a line without its newline, whatever stands before it; None if there is none."""
     match = _HEADER.match(line[line.rfind(b"<") :]) if b"<" in line else None
     return ReplyHeader(int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)) if match else None
 
 
 def _text(reply: Reply) -> str:
-    """The agent's line about a request that the device did not answer."""
+    """Word the agent's report of a request that the device did not answer."""
     return reply.body[:300].decode("ascii", "replace")
 
 
@@ -96,7 +96,7 @@ class SerialTransport(Transport):
                 self._exchange("BYE", "/")
 
     def switched_off(self) -> SwitchedOff | None:
-        """What the agent has switched off. Raises: LinkError, ProtocolError."""
+        """Ask the agent what it has switched off. Raises: LinkError, ProtocolError."""
         if self._line is None:
             self._open()
         return switched_off(self._exchange("PING", "/").body, self._clock)
@@ -184,7 +184,7 @@ class SerialTransport(Transport):
         raise LinkError(f"{method} {path}: no reply on {self.port} in {self._attempts} tries; is the agent running?")
 
     def _await(self, number: int, deadline: float) -> tuple[Reply | None, int]:
-        """The reply to the request `number`, or None when it must be repeated, and how many frames were damaged."""
+        """Await the reply to the request `number`, or None when it must be repeated, and count damaged frames."""
         damaged = 0
         while (line := self._until_newline(deadline)) is not None:
             header = decode_header(line)

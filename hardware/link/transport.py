@@ -41,7 +41,7 @@ def web_address(url: str) -> bool:
 
 
 def new_session() -> int:
-    """A name for a client, 1 to 65535, by which a board agent knows it from a second one."""
+    """Draw a name for a client, 1 to 65535, by which a board agent knows it from a second one."""
     return random.SystemRandom().randrange(1, 2**16)
 
 
@@ -58,7 +58,7 @@ class Transport(Protocol):
     """Carries one request at a time; a driver never retries blindly what is not idempotent."""
 
     def get(self, path: str) -> Reply:
-        """Raises: LinkError when no answer came."""
+        """Send a GET. Raises: LinkError when no answer came."""
         return self._request("GET", path)
 
     def post(self, path: str) -> Reply:
@@ -77,7 +77,7 @@ class Transport(Protocol):
         return
 
     def switched_off(self) -> SwitchedOff | None:
-        """What a dead-man switch on the way, if there is one, has switched off; None: it does not say.
+        """Ask a dead-man switch on the way, if there is one, what it has switched off; None: it does not say.
 
         Raises: as `get`.
         """
@@ -136,7 +136,7 @@ class SharedLink(Transport):
 
 
 def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff | None:
-    """What the status of a board agent says that it has switched off; None from an agent older than that.
+    """Read from the status of a board agent what it has switched off; None from an agent older than that.
 
     Args: clock: of the device. Raises: ProtocolError for a status that is not an agent's.
     """

@@ -88,7 +88,7 @@ class Ending:
         ]
 
     def beyond(self, booked_ml: float) -> list[Given]:
-        """What it gave beyond the feed that was booked when it began, its waste with it, in the order of time."""
+        """Return what the dose gave beyond the feed booked when it began, its waste with it, in the order of time."""
         low_ml, more_ml = self.least * self.feed_ml - booked_ml, self.feed_ml - booked_ml
         first = [Given(self.on_s, more_ml, low_ml, more_ml, self.pump)] if max(abs(more_ml), abs(low_ml)) > 1e-3 else []
         again = [Given(at_s, ml, self.least * ml, waste_ml, self.pump) for at_s, ml, waste_ml in self.repeats()]
@@ -101,7 +101,7 @@ class Ending:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Ending:
-        """The inverse of `row`. Raises: KeyError, TypeError, ValueError for a damaged row."""
+        """Invert `row`. Raises: KeyError, TypeError, ValueError for a damaged row."""
         on_s, feed_ml, waste_ml = (float(row[key]) for key in ("on_s", "feed_ml", "waste_ml"))
         last = (float(row.get(key, math.nan)) for key in ("feed_last_ml", "waste_last_ml", "feed_low_ml"))
         times = int(row["feed_times"]), int(row["waste_times"])
@@ -126,7 +126,7 @@ class Dosed:
 
 
 def feeds_by(row: Mapping[str, Any]) -> str:
-    """The pump that an intent feeds by. Raises: ValueError for one that there is not."""
+    """Return the pump that an intent feeds by. Raises: ValueError for one that there is not."""
     pump = str(row.get("feed_pump", "Pump1"))
     if pump not in FEEDS:
         raise ValueError(f"feed_pump {pump}")
@@ -172,6 +172,6 @@ def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
 
 
 def damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
-    """A row that is not as a driver writes it."""
+    """Build the error of a row that is not as a driver writes it."""
     what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
     return RecordingError(f"journal.jsonl: {what}; {REMEDY}")

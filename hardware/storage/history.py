@@ -39,7 +39,7 @@ class History:
     KEYS: ClassVar[Mapping[str, Callable[[Any], Any]]] = {"carry_ml": float, "doses": int, "temperature": float}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """What is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
+        """Return what is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
         kind = row["kind"]
         if kind not in self.KINDS:
             return self
@@ -64,7 +64,7 @@ H = TypeVar("H", bound=History)
 
 
 def replayed(rows: Sequence[Mapping[str, Any]], unknown: H) -> dict[str, H]:
-    """What the journal of a run says of each reactor.
+    """Replay the journal of a run for each reactor.
 
     Args: rows: that a driver has written, oldest first. unknown: of a reactor without rows.
     Raises: RecordingError for a row that is not as the driver wrote it.

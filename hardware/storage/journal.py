@@ -53,7 +53,7 @@ def _complete(data: bytes) -> int:
 
 
 def _tail(path: Path, before: int) -> bytes:
-    """The file from byte `before` on, from the next line on unless it is 0."""
+    """Read the file from byte `before` on, from the next line on unless it is 0."""
     with path.open("rb") as f:
         f.seek(before)
         if before:
@@ -62,7 +62,7 @@ def _tail(path: Path, before: int) -> bytes:
 
 
 def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
-    """The rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory.
+    """Yield rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory.
 
     These are LANDMARKS and, of each reactor whose dose is open at byte `before`, its rows from that dose on.
     """

@@ -64,7 +64,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def read_marks(folder: Path) -> list[Mark]:
-    """The marks of a run folder, as they were written; none where there is no file. Raises: RecordingError."""
+    """Read the marks of a run folder, as they were written; none where there is no file. Raises: RecordingError."""
     path = folder / NAME
     if not path.is_file():
         return []

@@ -97,14 +97,14 @@ class Table(NamedTuple):
     headers: Numbers
 
     def only(self, keep: Mask | Numbers) -> "Table":
-        """The rows of a mask, or at positions."""
+        """Return the rows of a mask, or at positions."""
         return Table._make(values[keep] for values in self)
 
 
 def read_table(
     path: Path, pump_ml_s: float, pumps: Sequence[int], reactor: str | None, rows: Rows, notes: list[str]
 ) -> tuple[Layout, Table]:
-    """The layout of a file and its rows. Args as of `read_recording`. Raises: RecordingError."""
+    """Read the layout of a file and its rows. Args as of `read_recording`. Raises: RecordingError."""
     cells = _cells(_lines(path, notes), notes)
     try:
         first = next(cells, None)
@@ -134,7 +134,7 @@ def read_table(
 
 @contextmanager
 def _open(path: Path) -> Iterator[io.TextIOWrapper]:
-    """A text file, gzipped or not, in UTF-8 or UTF-16."""
+    """Open a text file, gzipped or not, in UTF-8 or UTF-16."""
     with path.open("rb") as file:
         stream = gzip.GzipFile(fileobj=file) if file.peek(2).startswith(GZIP) else file
         wide = stream.peek(2).startswith((BOM_UTF16_LE, BOM_UTF16_BE))
@@ -143,7 +143,7 @@ def _open(path: Path) -> Iterator[io.TextIOWrapper]:
 
 
 def _lines(path: Path, notes: list[str]) -> Iterator[str]:
-    """The lines of a text file, without a last line that has no end: its last number may be cut.
+    """Yield the lines of a text file, without a last line that has no end: its last number may be cut.
 
     Raises: UnicodeError where the file is no text; OSError, EOFError and zlib.error.
     """
@@ -243,7 +243,7 @@ def _feeding(path: Path, at: dict[int, int], pumps: Sequence[int]) -> tuple[tupl
 
 
 def _number(cell: str) -> float:
-    """A cell as a number, a date (ISO 8601, UTC unless it says otherwise) as s since 1970, nan for other text."""
+    """Convert a cell to a number, a date (ISO 8601, UTC unless it says otherwise) to s since 1970, else to nan."""
     try:
         return float(cell)
     except ValueError:
@@ -296,7 +296,7 @@ def _read(layout: Layout, rows: Iterable[list[str]]) -> _Read:
 
 
 def _of_reactor(path: Path, read: _Read, reactor: str | None, notes: list[str]) -> Mask:
-    """The rows of one reactor and those that are cut off before its name, (n,). Raises: RecordingError."""
+    """Find the rows of one reactor and those that are cut off before its name, (n,). Raises: RecordingError."""
     names = read.reactors or [""]
     name = names[0] if reactor is None else reactor
     others = sorted({*names} - {name})
@@ -326,7 +326,7 @@ def _in_house_units(layout: Layout, read: _Read) -> Table:
 
 
 def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> Array:
-    """Times in min; dates and times since 1970 from the first row on. nan where a row's time is of another kind."""
+    """Convert times to min; dates and times since 1970 from the first row on. nan for a time of another kind."""
     known = time[np.isfinite(time)]
     middle = float(np.median(known)) if len(known) else 0.0
     for floor, per_minute, words in EPOCHS:

@@ -106,7 +106,7 @@ def read_recording(
 
 
 def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[str], doubts: Doubts) -> Recording:
-    """The recording that rows with finite times and rates make, without what cannot be used."""
+    """Build the recording of rows with finite times and rates, without what cannot be used."""
     backward = _backward(path, table.pump_rate, table.number)
     _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
     table = table.only(~backward)
@@ -130,7 +130,7 @@ def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[
 
 
 def _with_times_and_rates(path: Path, table: Table, notes: list[str]) -> Table:
-    """The rows that have both. Raises: RecordingError when too many have no pump rate, or none has both."""
+    """Keep the rows that have both. Raises: RecordingError when too many have no pump rate, or none has both."""
     width = int(np.median(table.width))
     short = table.width < width
     lost = short | ~np.isfinite(table.pump_rate)

@@ -10,7 +10,7 @@ LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours
 
 
 def read_text(path: Path | str) -> str:
-    """The text of a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
+    """Read a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
 
     Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
     """
