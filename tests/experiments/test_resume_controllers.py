@@ -1,6 +1,7 @@
 """A run that is stopped or killed and resumed: its controller decides what one that never stopped decides."""
 
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,7 @@ def cut_and_continued(kind: str, folder: Path, forgets: bool = False) -> list[St
     files.write_json(folder / "state.json", {"journal_row": 0, **first.state()}, False, indent=None)
     second, state = loop(kind, reactors), load_state(folder / "state.json")
     if forgets:
-        state["controller"] = second.state()["controller"]
+        del state["controller"]
     second.restore(state)
     return steps + [second.step() for _ in range(LENGTH - CUT)]
 
@@ -243,3 +244,26 @@ def test_what_is_put_off_is_told_once_across_a_kill(
     list(run.run(run.clock.now() + 240.0))
     assert run.told_ml() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]) + run.put_off_ml(), abs=1e-3)
     run.close()
+
+
+def test_a_state_of_an_earlier_version_is_resumed_and_its_controller_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = Rehearsal(tmp_path, rehearsed(("M0",), HOLD), quiet(mu=0.03), od=0.5)
+    run.begin()
+    list(run.run(1200.0))
+    run.reactors.stop()
+    run.close()
+    path = tmp_path / "state.json"
+    state = json.loads(path.read_text())
+    del state["controller"]
+    path.write_text(json.dumps(state))
+    with caplog.at_level(logging.WARNING):
+        run.begin()
+    (said,) = [record.getMessage() for record in caplog.records if "controller" in record.getMessage()]
+    assert str(path) in said
+    steps = [step for step in run.run(2700.0) if step.rows[0]]
+    assert steps[0].proposed[0] > 0.0
+    assert abs(run.truth("M0")["od"] - 0.5) < 0.02
+    run.close()
+    assert "controller" in json.loads(path.read_text())
