@@ -33,7 +33,7 @@ LABEL = re.compile(r"^(Args|Attributes|Raises|Returns|State|Yields)\b([^:]*):\s*
 
 
 def _plain(text: str) -> str:
-    """A line of a docstring as reStructuredText: only `code` is markup."""
+    """Turn a line of a docstring into reStructuredText: only `code` is markup."""
     parts = text.split("`")
     escaped = [re.sub(r"([\\*|_])", r"\\\1", part) if k % 2 == 0 else part for k, part in enumerate(parts)]
     return "``".join(escaped) if len(parts) % 2 else re.sub(r"([\\*|_`])", r"\\\1", text)
@@ -72,7 +72,7 @@ def _rendered(block: list[str]) -> Iterator[str]:
 
 
 def _docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """The docstrings are written for a terminal; a page shows them without changing a word."""
+    """Render docstrings, which are written for a terminal, on a page without changing a word."""
     lines[:] = [line for block in _blocks(lines) for line in (*_rendered(block), "")]
 
 
@@ -84,7 +84,7 @@ def _formula(page: Any, node: Any, display: str) -> None:
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx."""
+    """Set Sphinx up."""
     inline, block = (lambda page, node, d=display: _formula(page, node, d) for display in ("inline", "block"))
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("autodoc-process-docstring", _docstring)

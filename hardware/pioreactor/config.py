@@ -19,7 +19,7 @@ FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's most in each vial
 
 
 def vial_ml(volume_ml: float) -> int:
-    """The vendor's vial for a culture of this volume, mL."""
+    """Return the vendor's vial for a culture of this volume, mL."""
     return 20 if volume_ml <= 15.0 else 40
 
 

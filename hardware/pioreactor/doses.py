@@ -62,7 +62,7 @@ class Doses:
         self._course = self._look_for(history) if history.open else None
 
     def plan(self, rate: float) -> Plan:
-        """What a mean rate comes to, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
+        """Plan the dose of a mean rate, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
         if not (rate >= 0.0 and math.isfinite(rate)):
             raise ValueError(f"pump rate = {rate} mL/s: allowed finite numbers >= 0")
         asked = rate * self.pumps.unit.bench.period_s + (self.carry_ml if rate > 0.0 else 0.0)
@@ -134,7 +134,7 @@ class Doses:
         yield from self._conclude(plan, dose, on_s, media, waste)
 
     def _look_for(self, history: History) -> Iterator[float]:
-        """The dose an earlier life left open: what became of it while nobody watched, and what still may."""
+        """Look for the dose an earlier life left open: what became of it while nobody watched, and what still may."""
         pumps, dose, asked_ml = self.pumps, history.id, history.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
@@ -149,7 +149,7 @@ class Doses:
         yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
-        """A dose's end on record, then the vial back at its tube, then what was booked when it began put right."""
+        """Conclude a dose: record its end, drain the vial to its tube, then correct what was booked when it began."""
         self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
         for moved, pump in ((media, "media"), (waste, "waste")):
             if moved.end:
@@ -179,7 +179,7 @@ class Doses:
     # -- what nobody commanded -------------------------------------------------------------------------------------
 
     def _silence(self, job: str) -> Iterator[float]:
-        """A pump that runs without a job, or whose job was killed: ended, and what it moved on record."""
+        """End a pump that runs without a job, or whose job was killed, and record what it moved."""
         pin, name = self.pumps.pin(job), f"{self.pumps.short}/{self._book.elapsed():.0f}"
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
@@ -220,7 +220,7 @@ class Doses:
         self._give(job, ml, ml, self.foreign)
 
     def _give(self, job: str, low_ml: float, high_ml: float, why: str) -> None:
-        """What a pump moved beside our doses, as what it is: when it was noticed, how much, by whom."""
+        """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
         fed = job != WASTE
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, (not fed) * high_ml)
         self.extra.append(given)

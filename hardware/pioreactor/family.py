@@ -33,7 +33,7 @@ class PioreactorFamily(Family):
     called = "Pioreactors"
 
     def reached(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> Reached:
-        """The config by which the units are reached for as long as the run lasts. Raises: ReactorError."""
+        """Return the config by which the units are reached for as long as the run lasts. Raises: ReactorError."""
         return nullcontext(backend)
 
     @contextmanager
@@ -69,7 +69,7 @@ class PioreactorFamily(Family):
             return preflight(reactors)
 
     def no_thermostat(self, backend: PioreactorConfig) -> str | None:
-        """The vendor's may be left off."""
+        """Return None: the vendor's thermostat may be left off."""
         return None if backend.thermostat else " without backend.thermostat=true"
 
     def doses(self, backend: PioreactorConfig, bench: Bench) -> None:
@@ -91,7 +91,7 @@ class PioreactorFamily(Family):
             )
 
     def rim_ml(self, volumes_ml: Array) -> Array:
-        """The vendor's limit of each vial."""
+        """Return the vendor's limit of each vial."""
         return np.array([FULL_ML[vial_ml(ml)] for ml in volumes_ml])
 
     def address(self, backend: PioreactorConfig) -> str:

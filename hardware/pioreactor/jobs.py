@@ -17,7 +17,7 @@ GONE = {OD: "takes no OD readings", HEAT: "does not heat", STIR: "does not stir"
 
 
 def target_of(config: PioreactorConfig, facts: Facts, setpoint: float) -> dict[str, Any]:
-    """What the vendor's turbidostat is told of its target: a setpoint, OD, as its own reading."""
+    """Build the options of the vendor's turbidostat: a setpoint, OD, as its own reading."""
     return {facts.target: setpoint / config.od_scale + config.od_zero, **dict(facts.signal)}
 
 
@@ -45,7 +45,7 @@ def regulates(settings: Any, asked: dict[str, Any]) -> bool:
 
 
 def flow(calibrations: Any, pump: str) -> float:
-    """mL per second at the calibrated duty. Raises: DeviceStateError if the unit has no usable calibration of it.
+    """Return mL per second at the calibrated duty. Raises: DeviceStateError without a usable calibration.
 
     A line is a list [slope, intercept], or in newer versions {type: poly, coefficients: [slope, intercept]}; of other
     curves the slope is that of the line through 0 that fits what was weighed.

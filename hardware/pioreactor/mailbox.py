@@ -68,7 +68,7 @@ class Pin:
         self.inits = deque[float](maxlen=8)
 
     def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
-        """A message that has all pins of the unit, of -inf if it was retained and the pin is on.
+        """Take a message that has all pins of the unit, of -inf if it was retained and the pin is on.
 
         Where others say pins, too (echoes), they do so late: on without a job (its word) is what is said twice.
         """
@@ -87,7 +87,7 @@ class Pin:
             self.on, self.on_s = True, min(on_s, self.event_s)  # a job that stands still says its pin late
 
     def ends(self, at: float) -> None:
-        """It stands still; what it ran until then counts once."""
+        """End the pin's run; what it ran until then counts once."""
         began = self.on_s if self.on else self.event_s
         self.ran_s += at - began if math.isfinite(began) else 0.0
         if self.on or began < math.inf:
@@ -192,7 +192,7 @@ class Mailbox:
                 pin.ends(at)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
-        """A retained reading is the last one of whatever was before; one with the stamp of another is the same."""
+        """Take a reading; a retained one is the last one of before, and one with the stamp of another is the same."""
         stamp = str(said["timestamp"])
         if retained or stamp == self._stamp:
             self.refused += 1
@@ -202,14 +202,14 @@ class Mailbox:
         self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:
-        """What jobs said of themselves, before it is said again; a pump's job ends with the broker."""
+        """Forget what jobs said of themselves, before they say it again; a pump's job ends with the broker."""
         with self.lock:
             self.states.clear()
             for pin in self.pins.values():
                 pin.event_s = math.inf
 
     def drain(self) -> tuple[list[Reading], list[Event], list[str]]:
-        """Readings, events, and what was ignored, since the last call."""
+        """Return readings, events, and what was ignored, since the last call."""
         with self.lock:
             found = list(self.readings), list(self.events), self.ignored
             self.readings.clear()
@@ -218,7 +218,7 @@ class Mailbox:
         return found
 
     def state(self, job: str) -> State:
-        """What a job of our experiment last said."""
+        """Return what a job of our experiment last said."""
         return self.states.get((self._experiment, job), State())
 
     def live(self, job: str) -> bool:
@@ -237,7 +237,7 @@ class Mailbox:
 
 
 def _number(said: Any) -> float:
-    """A finite number, of text too. Raises: TypeError, ValueError, OverflowError."""
+    """Convert to a finite number, of text too. Raises: TypeError, ValueError, OverflowError."""
     value = float(said) if isinstance(said, int | float | str | bytes) and not isinstance(said, bool) else math.nan
     if not math.isfinite(value):
         raise ValueError(f"no number: {str(said)[:40]!r}")

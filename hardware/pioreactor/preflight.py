@@ -23,7 +23,7 @@ CLOCK_S, QUEUE_S = 30.0, 20.0
 
 
 def preflight(reactors: PioreactorReactors) -> list[Check]:
-    """The broker, then per unit what a run needs of it. Raises: nothing about a unit."""
+    """Check the broker, then per unit what a run needs of it. Raises: nothing about a unit."""
     try:
         reactors.connect()
         checks = [Check("broker", True, f"{reactors.config.broker} lets {reactors.config.username} in")]
@@ -39,7 +39,7 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
 
 
 def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
-    """Checks of one unit. Raises: ReactorError where it does not answer."""
+    """Check one unit. Raises: ReactorError where it does not answer."""
     unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))
@@ -100,7 +100,7 @@ def _experiment(name: str, wanted: str, leader: Web) -> Check:
 
 
 def _settings(name: str, web: Web, leader: Web) -> dict[str, Any]:
-    """The unit's configuration by section: newer versions tell it themselves. Raises: ReactorError."""
+    """Read the unit's configuration by section: newer versions tell it themselves. Raises: ReactorError."""
     try:
         found = web.get("/config/merged")
     except NotHeard:

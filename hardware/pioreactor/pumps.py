@@ -80,7 +80,7 @@ class Calls:
         return due
 
     def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
-        """The answer that came since the last call; None while there is none, and for trouble on the way."""
+        """Return the answer that came since the last call; None while there is none, and for trouble on the way."""
         if kind not in self._open and self.due(kind, every_s):
             self._open[kind] = self._web.ask(what, *given)
         if kind in self._open and self._open[kind].done():
@@ -135,12 +135,12 @@ class Pumps:
         self.short = f"{self.ours}{unit.name}/off"
 
     def take(self, event: Event) -> None:
-        """A dosing event; a correction is negative, and of what was reported."""
+        """Take a dosing event; a correction is negative, and of what was reported."""
         key = event.pump, event.source
         self.reported[key] = max(self.reported.get(key, 0.0) + event.ml, 0.0)
 
     def pin(self, job: str) -> Pin:
-        """That a job drives."""
+        """Return the pin that a job drives."""
         return self.box.pins[self.box.jobs[job]]
 
     def lost(self, job: str) -> bool:
@@ -169,7 +169,7 @@ class Pumps:
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
 
     def said(self, request: Request) -> float:
-        """What the events of a run reported so far, mL."""
+        """Sum what the events of a run reported so far, mL."""
         return self.reported.get((request.job, request.dose), 0.0)
 
     def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
@@ -208,7 +208,7 @@ class Pumps:
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
-        """A job to its end; what it gave."""
+        """Follow a job to its end; return what it gave."""
         job = request.job
         if why := (yield from self._begins(request)):
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
@@ -225,7 +225,7 @@ class Pumps:
         return self.mqtt.broke_s >= request.asked_s
 
     def _begins(self, request: Request) -> Steps[str]:
-        """A request until its pump begins, then ""; or until it is certain that it never will, then why (as below)."""
+        """Wait until a request's pump begins, then ""; or until it certainly never will, then why (as below)."""
         job, asked_s, what = request.job, request.asked_s, f"{request.ml:.2f} mL"
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
         never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
@@ -261,7 +261,7 @@ class Pumps:
         return why
 
     def last_word(self, request: Request) -> str:
-        """What the job of a run last said of itself; "" is unknown: two processes share a topic, or it broke."""
+        """Return what the job of a run last said of itself; "" is unknown: two processes share a topic, or it broke."""
         pin, state = self.pin(request.job), self.box.state(request.job)
         alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
         return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
@@ -274,7 +274,7 @@ class Pumps:
         return ended and (self.said(request) >= request.ml - 1e-6 or self.clock.now() > state.at + SETTLE_S)
 
     def _moved(self, request: Request) -> Moved:
-        """What a job that ended by itself gave, by its events and by how long its pin was on."""
+        """Return what a job that ended by itself gave, by its events and by how long its pin was on."""
         flow, ml, said_ml, end = self.flow_ml_s[request.job], request.ml, self.said(request), ""
         low = high = said_ml
         ran_ml = (self.pin(request.job).ran_s - request.ran_s) * flow
@@ -362,7 +362,7 @@ class ForcedEnd:
         self._rebooted = self._lost = self._held = False
 
     def _shorts(self) -> float:
-        """What short runs of the pump reported, mL."""
+        """Sum what short runs of the pump reported, mL."""
         return self._p.reported.get((self._job, self._p.short), 0.0)
 
     def act(self) -> None:
@@ -385,7 +385,7 @@ class ForcedEnd:
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
     def _look(self) -> Seen:
-        """What is known now."""
+        """Return what is known now."""
         p, pin, state = self._p, self._p.pin(self._job), self._p.box.state(self._job)
         self._lost = self._lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
@@ -420,8 +420,10 @@ class ForcedEnd:
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
-        """What a pump that runs on, or told that it is about to and no end, moved up to now, mL; 0 for one of a silent
-        unit, and for one whose bottle is empty by now."""
+        """Return what a pump moved up to now that runs on, or reported a start and no end, mL.
+
+        0 for the pump of a silent unit, and for one whose bottle is empty by now.
+        """
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
         silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self._lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
@@ -429,7 +431,7 @@ class ForcedEnd:
         return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
-        """What the pump moved since it was asked. Args: off_s: as of `off_s`."""
+        """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
         longest = max(min(off_s, self._still_s) - self._from_s, 0.0) * flow

@@ -22,7 +22,7 @@ class History(history.History):
     KEYS: ClassVar = {**history.History.KEYS, "boot": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """What is known after one more row of this unit. Raises: as a row that is damaged makes it."""
+        """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
         known = super().after(row)
         if row["kind"] == "intent":
             return replace(known, id=str(row["id"]), task="")
@@ -32,5 +32,5 @@ class History(history.History):
 
 
 def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, History]:
-    """What the journal of a run says of each unit. Args: rows: oldest first. Raises: RecordingError."""
+    """Replay the journal of a run for each unit. Args: rows: oldest first. Raises: RecordingError."""
     return history.replayed(rows, History())

@@ -18,8 +18,11 @@ COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt
 
 @dataclass(frozen=True)
 class Sample:
-    """at: clock time of the readings' middle. od, spread: their median and its robust sd. raw: as the interlock's
-    counts. number: of readings."""
+    """Median of the readings of one sample.
+
+    at: clock time of their middle. od, spread: median and its robust sd. raw: as the interlock's counts. number: of
+    readings.
+    """
 
     at: float
     od: float
@@ -39,12 +42,12 @@ class Sampling:
         self._due = -math.inf
 
     def take(self, readings: list[Reading]) -> None:
-        """Readings that arrived, at clock times."""
+        """Take readings that arrived, at clock times."""
         self._readings.extend(readings)
         self.read_s = readings[-1].at if readings else self.read_s
 
     def look(self, now: float, undisturbed_s: float) -> Sample | None:
-        """The sample that is due, None if none is or the readings are not there, which count from undisturbed_s."""
+        """Return the sample that is due, None without one or without readings, which count from undisturbed_s."""
         begin = max(undisturbed_s, now - self._config.window_s)
         used = [r for r in self._readings if r.at >= begin] if now >= self._due else []
         if len(used) < FEWEST:

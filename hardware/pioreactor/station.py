@@ -99,7 +99,7 @@ class Station:
             yield from self._end_job(STIR) if own else ()
 
     def lie_down(self, error: ReactorError, history: History) -> None:
-        """It could not be brought up in a run that goes on without it meanwhile: tried again after a while."""
+        """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
         self.book.report(Fault("link", str(error), "the others go on, and this one is tried again"))
         self._course = self._rise(history)
 
@@ -187,7 +187,7 @@ class Station:
         return (round(self.sampling.newest.at, 3), self.sampling.count) if self.sampling.count else None
 
     def _wrong(self) -> Fault | None:
-        """What is wrong now."""
+        """Return what is wrong now."""
         if not self._mqtt.connected:
             return Fault("link", "no MQTT broker", "look at the leader: power, network, mosquitto; doses wait")
         if self._pumps.trouble:
@@ -215,7 +215,7 @@ class Station:
         return None
 
     def _wanted(self) -> list[str]:
-        """The jobs that this run keeps going."""
+        """List the jobs that this run keeps going."""
         heated = self._config.thermostat and not self.heat_is_off and math.isfinite(self._target)
         wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: self.handed_over}
         return [job for job, it_is in wanted.items() if it_is]

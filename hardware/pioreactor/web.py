@@ -37,7 +37,7 @@ class Web:
         return self._pool.submit(what, *given)
 
     def get(self, path: str, below: str = "/unit_api") -> Any:
-        """The answer's content. Raises: LinkError, ProtocolError."""
+        """Get the answer's content. Raises: LinkError, ProtocolError."""
         return self.send("GET", path, None, below)
 
     def run(self, job: str, options: Mapping[str, Any], overrides: Sequence[Sequence[str]] = ()) -> str:
@@ -90,14 +90,14 @@ class Web:
         return answer["status"] != "failed" and result is not False
 
     def running(self) -> list[dict[str, Any]]:
-        """The vendor's list of running jobs, and of killed ones. Raises: LinkError, ProtocolError."""
+        """Get the vendor's list of running jobs, and of killed ones. Raises: LinkError, ProtocolError."""
         jobs = self.get("/jobs/running")
         if not (isinstance(jobs, list) and all(isinstance(job, dict) and "job_name" in job for job in jobs)):
             raise ProtocolError(f"{self.url}: {str(jobs)[:60]} is no list of jobs")
         return jobs
 
     def send(self, method: str, path: str, body: Mapping[str, Any] | None, below: str = "/unit_api") -> Any:
-        """The answer's content. Raises: NotHeard if it cannot have been carried out; other ReactorError if it may."""
+        """Send a request. Raises: NotHeard if it cannot have been carried out; other ReactorError if it may."""
         url, content = f"{self.url}{below}{path}", None if body is None else json.dumps(body).encode()
         try:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)

@@ -19,7 +19,7 @@ PYTHONS = ("python3.13", "python3.14", "python3.12")
 
 
 def _python() -> str | None:
-    """A Python of 3.12 or newer: the vendor's package is written in its syntax."""
+    """Find a Python of 3.12 or newer: the vendor's package is written in its syntax."""
     beside = sorted(Path("~/.pyenv/versions").expanduser().glob("3.1[2-4]*/bin/python"), reverse=True)
     found = [path for name in PYTHONS if (path := shutil.which(name))]
     return next((p for p in [*map(str, beside), *found] if _runs(p)), None)
@@ -31,7 +31,7 @@ def _runs(python: str) -> bool:
 
 
 def broker() -> str | None:
-    """The path of the MQTT broker, None if there is none."""
+    """Find the MQTT broker, None if there is none."""
     return shutil.which("mosquitto") or shutil.which("/usr/sbin/mosquitto")
 
 
@@ -53,7 +53,7 @@ def version(env: Path) -> str:
 
 
 def missing(package: str = PUBLISHED, folder: str = "") -> str:
-    """What this computer lacks for the rig, with the remedy; "" if nothing but the environment itself."""
+    """Say what this computer lacks for the rig, with the remedy; "" if nothing but the environment itself."""
     if broker() is None:
         return "no MQTT broker: apt-get install mosquitto"
     if package.endswith(".whl") and not Path(package).expanduser().is_file():
@@ -64,7 +64,7 @@ def missing(package: str = PUBLISHED, folder: str = "") -> str:
 
 
 def newer() -> str:
-    """A version on the package index that is newer than what was tried, in a line; "" for none, or without network."""
+    """Name a version on the package index newer than those tried, in a line; "" for none, or without network."""
     ask = [sys.executable, "-m", "pip", "index", "versions", "pioreactor", "--python-version", "3.13", "--retries", "0"]
     said = subprocess.run(ask, capture_output=True, text=True, check=False).stdout
     found = re.match(r"pioreactor \(([\d.]+)\)", said)
@@ -74,7 +74,7 @@ def newer() -> str:
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:
-    """The environment with the vendor's package, built if it is not there. Args: as of `home`.
+    """Build the environment with the vendor's package, if it is not there. Args: as of `home`.
 
     Raises: DeviceStateError with what is missing, or pip's last line.
     """

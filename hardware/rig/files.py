@@ -74,7 +74,7 @@ def flows(k: int) -> dict[str, float]:
 
 
 def model(volume_ml: float) -> str:
-    """The vendor's name of a unit with a vial for this culture."""
+    """Return the vendor's name of a unit with a vial for this culture."""
     return f"pioreactor_{vial_ml(volume_ml)}ml"
 
 
@@ -104,7 +104,7 @@ def layout(
 
 
 def _calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
-    """A calibration of a pump in the vendor's format, which moves `flow_ml_s` at full duty."""
+    """Build a calibration of a pump in the vendor's format, which moves `flow_ml_s` at full duty."""
     points, line = [0.5, 1.0, 2.0], [flow_ml_s, 0.0]
     curve = f"{{type: poly, coefficients: {line}}}" if known.curve_struct else f"{line}\ncurve_type: poly"
     return (
@@ -115,7 +115,7 @@ def _calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
 
 
 def database(path: Path, units: Mapping[str, float], experiment: str) -> None:
-    """What the leader must know: its units, and the experiment that all of them are assigned to."""
+    """Write what the leader must know: its units, and the experiment that all of them are assigned to."""
     with sqlite3.connect(path) as db:
         db.executescript(TABLES)
         db.execute("INSERT INTO experiments VALUES (?, ?, '')", (experiment, AT))
@@ -125,6 +125,6 @@ def database(path: Path, units: Mapping[str, float], experiment: str) -> None:
 
 
 def wrapper(program: Path, variables: Mapping[str, str]) -> str:
-    """A script that runs one of the vendor's programs with the rig's variables, which its task queue drops."""
+    """Write a script that runs one of the vendor's programs with the rig's variables, which its task queue drops."""
     lines = "".join(f"export {key}='{value}'\n" for key, value in variables.items())
     return f'#!/bin/sh\n{lines}exec "{program}" "$@"\n'

@@ -22,7 +22,7 @@ NOISE = 0.02  # sd of one look, as a fraction; forty of them are averaged
 
 
 def ask(what: dict[str, Any]) -> dict[str, Any]:
-    """The rig's answer; nothing after half a second."""
+    """Ask the rig; nothing after half a second."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.settimeout(0.5)
         try:

@@ -125,12 +125,12 @@ class Rig:
         }  # fmt: skip
 
     def kill(self, name: str) -> None:
-        """kill -9 of one process."""
+        """Kill one process by kill -9."""
         self.processes[name].kill()
         self.processes[name].wait()
 
     def reboot(self, unit: str) -> None:
-        """A unit loses its power and boots: its processes end at once, its pins fall to 0, what lay in memory is gone.
+        """Reboot a unit: its processes end at once, its pins fall to 0, what lay in memory is gone.
 
         Raises: DeviceStateError if its web server does not come back.
         """
@@ -138,7 +138,7 @@ class Rig:
         self.boot(unit)
 
     def cut(self, unit: str) -> None:
-        """A unit loses its power."""
+        """Cut the power of a unit."""
         for name in UNIT:
             self.kill(f"{unit} {name}")
         _kill(self.jobs(unit))
@@ -147,7 +147,7 @@ class Rig:
         (self.folder / unit / "cache").mkdir()
 
     def boot(self, unit: str) -> None:
-        """A unit that had no power gets it. Raises: DeviceStateError if its web server does not come back."""
+        """Boot a unit that had no power. Raises: DeviceStateError if its web server does not come back."""
         for name in UNIT:
             self.start(f"{unit} {name}")
         _wait(self.hosts[unit], self.port, f"the web server of {unit}")

@@ -92,7 +92,7 @@ class _Vial:
         self.peak_ml = max(self.peak_ml, float(self.plant.vessel.volume_ml[0]))
 
     def drive(self, pin: int, duty: float, pid: int, now: float) -> None:
-        """A pin's duty changes, in percent."""
+        """Change a pin's duty, in percent."""
         self.sync(now)
         if pin == HEATER:
             self.heat, self._heated_by = duty, pid
@@ -110,7 +110,7 @@ class _Vial:
         self.duty[pin] = duty
 
     def truth(self) -> dict[str, Any]:
-        """What is really in the vial and what was really moved."""
+        """Return what is really in the vial and what was really moved."""
         return {
             "od": float(self.plant.apparent_od[0]),
             "volume_ml": float(self.plant.vessel.volume_ml[0]),
