@@ -202,6 +202,12 @@ def _terminal(data: Any) -> str:
     return _line(str(text)[:400].split("</br>", 1)[0])
 
 
+def _spoilt(pump: Any) -> bool:
+    """Tell whether a pump's target or its record, if it has one, holds nan, which stays."""
+    record = pump.get("record")
+    return any(x != x for x in (pump["target"], *(record if isinstance(record, list) else ())))
+
+
 def _modes(data: Any) -> tuple[str, ...]:
     names = ("Zigzag", "Custom", "Chemostat", "Light", *SLOTS)
     return tuple(n for n in names if n in data and _flag(data, n, "ON"))
@@ -260,7 +266,7 @@ def parse_state(body: bytes) -> DeviceState:
         volume_ml=_number(data, "Volume", "target"),
         terminal=_terminal(data),
         slots=tuple(_slot(data, n) for n in SLOTS if n in data),
-        spoilt=tuple(p for p in PUMPS if any(x != x for x in (data[p]["target"], *data[p].get("record", ())))),
+        spoilt=tuple(p for p in PUMPS if _spoilt(data[p])),
     )
 
 
