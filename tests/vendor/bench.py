@@ -421,7 +421,7 @@ class Client:
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        with self._console.open("a") as console:
+        with self.process.stdout, self._console.open("a") as console:
             for line in self.process.stdout:
                 self.lines.append((self._bench.now(), line.rstrip("\n")))
                 console.write(f"{self._bench.now():9.1f} {line}")
