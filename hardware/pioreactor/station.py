@@ -205,7 +205,8 @@ class Station:
         if self._missing:
             forget, job = self._pumps.facts.forget, self._missing[0]
             word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
-            again = "it ended twice, start it in the vendor's page" if job in self._ended else "asked for again"
+            twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
+            again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
             remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
             return Fault("stopped", f"the unit {GONE[job]}", remedy)
         if math.isinf(self._box.dc_s):
@@ -239,7 +240,7 @@ class Station:
             return False
         if self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S:
             self._gone.add(job)
-            ended = job != OD and self._box.state(job).word == "disconnected" and job in self._been
+            ended = job != OD and self._box.state(job).word == "disconnected" and job in self._been and not self._astray
             if self._course is None and not (ended and job in self._ended):
                 self._asked_s[job], self._course = self._real.now(), self._again(job)
                 self._ended |= {job} if ended else set()

@@ -139,6 +139,7 @@ class Journal:
         """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
         if self._file is None:
             raise RecordingError(f"journal {self.path}: written to after it was closed")
+        self._count_interrupted()
         row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(uptime(), 3), "kind": kind}
         line = json.dumps(_plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
@@ -146,13 +147,24 @@ class Journal:
             if written != len(line):
                 os.ftruncate(self._file, self._size)
                 raise OSError(28, "No space left on device")
+            self.next_row += 1
+            self._size += written
             if self._fsync:
                 os.fsync(self._file)
         except OSError as error:
             remedy = "free disk space, then resume the run"
             raise RecordingError(f"journal {self.path}: {error.strerror or error}; {remedy}") from error
-        self.next_row += 1
-        self._size += written
+
+    def _count_interrupted(self) -> None:
+        """Count a row that a stop interrupted after its write; cut what was written of one in part."""
+        assert self._file is not None
+        if os.fstat(self._file).st_size > self._size:
+            more = _tail(self.path, max(self._size - 1, 0))
+            whole = more[: more.rfind(b"\n") + 1]
+            self.next_row += whole.count(b"\n")
+            self._size += len(whole)
+            if more != whole:
+                os.ftruncate(self._file, self._size)
 
     def reread(self) -> list[dict[str, Any]]:
         """Its newest rows, 20 MB of them, as they are on the disk now. Raises: RecordingError."""

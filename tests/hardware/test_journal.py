@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,7 @@ def test_a_full_disk_is_told_and_leaves_no_half_row(tmp_path: Path, monkeypatch:
 WRITER = """
 import sys
 from pathlib import Path
+from typing import Any
 from hardware.storage.journal import Journal
 journal = Journal(Path(sys.argv[1]), fsync=False)
 k = 0
@@ -109,6 +111,33 @@ while True:
     print(k, flush=True)
     k += 1
 """
+
+
+@pytest.mark.parametrize("where", ["write", "fsync"])
+def test_a_stop_within_a_row_neither_cuts_nor_doubles_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """The stop comes when the row is written and not yet counted; the disk takes only a part of the row after it."""
+    journal, call, write = Journal(tmp_path / "journal.jsonl"), getattr(os, where), os.write
+    journal.append("first", {})
+
+    def stopped(*arguments: Any) -> None:
+        call(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, where, stopped)
+        with pytest.raises(KeyboardInterrupt):
+            journal.append("stopped", {})
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", lambda file, line: write(file, line[:7]))
+        with pytest.raises(RecordingError):
+            journal.append("full disk", {})
+    journal.append("last", {})
+    journal.close()
+    rows, torn = read_journal(journal.path)
+    assert torn == 0
+    assert [(row["n"], row["kind"]) for row in rows] == [(0, "first"), (1, "stopped"), (2, "last")]
 
 
 def test_kill_9_loses_no_row_that_was_confirmed(tmp_path: Path) -> None:
