@@ -99,7 +99,7 @@ def test_what_ends_by_itself_is_told_and_started_again_once_and_held_after_that(
     for held in (False, True, True):
         lab.world.over(job)
         lab.until(lambda: lab.fault is not None, 60.0)
-        assert lab.fault.kind == "stopped"
+        assert (lab.fault.kind, "start it" in lab.fault.remedy) == ("stopped", held)
         lab.wait(300.0)
         assert (len(started(lab, job)), lab.fault is not None, lab.dose(0.5) == 0.0) == (2, held, held)
         if held:
@@ -116,8 +116,11 @@ def test_a_unit_that_was_reassigned_made_inactive_or_removed_is_told_and_not_dos
     assert lab.fault.kind == "mode"
     lab.sample()
     assert lab.dose(0.5) == 0.0
+    for _ in range(2):  # the vendor ends it there as often as it is started, and that is no fault of the job
+        lab.world.over("stirring")
+        lab.wait(200.0)
     lab.world.assigned = ours
-    lab.until(lambda: lab.fault is None, 60.0)
+    lab.until(lambda: lab.fault is None, 200.0)
 
 
 def test_a_run_keeps_its_id_when_it_is_resumed(lab, monkeypatch, tmp_path):
