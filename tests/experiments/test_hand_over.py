@@ -1,8 +1,5 @@
 """A reactor that was handed over to the on-board regulation is never without control, however the program ends."""
 
-import json
-import time
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -10,28 +7,12 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
+from experiments.control import run as control
 from experiments.laws.base import Array, Controller, Mask
 from hardware.emulator.faults import inject
-from hardware.emulator.process import EmulatorProcess
 from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
-from tests.experiments.test_exits import SPEED, Bench
-from tests.patience import PATIENCE_S
-
-LOST = """
-import experiments.deploy
-import numpy as np
-from experiments.laws.density.inverse import Inverse
-whole = Inverse.act
-calls = []
-def act(self, *arguments):
-    calls.append(0)
-    rate = whole(self, *arguments)
-    return np.where([len(calls) > 2, False], np.nan, rate)
-Inverse.act = act
-experiments.deploy.main()
-"""
 
 
 class Losing:
@@ -123,7 +104,9 @@ def posted(run: Losable) -> list[str]:
 
 
 @pytest.mark.parametrize("sound", [True, False])
-def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_path: Path, sound: bool) -> None:
+def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(
+    tmp_path: Path, sound: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     run = handed_over(tmp_path)
     run.sound = sound
     paths = posted(run)
@@ -132,7 +115,10 @@ def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_pat
     regulated_at(run)
     notes = [row["note"] for row in run.journaled("note")]
     assert "handed over to the on-board regulation at OD 0.5 earlier in this run: left to it" in notes
-    run.reactors.stop()
+    monkeypatch.setattr(run.loop, "run", lambda: ())
+    with caplog.at_level("INFO"):
+        assert control._run(run.loop, run.record, lambda *_: None) == "completed"
+    assert "; M0: left to" in caplog.text
     assert run.data()["OD"]["ON"] == 1
 
 
@@ -231,38 +217,3 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     assert run.data()["OD"]["ON"] == 0
     assert run.device.vials["M0"].on_s["Pump1"] == fed
     assert run.device.vials["M1"].on_s["Pump1"] > 0.0
-
-
-@pytest.mark.slow
-def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-
-    def od(device: EmulatorProcess) -> dict[str, Any]:
-        with urllib.request.urlopen(f"{device.control}/_emulator/truth", timeout=10.0) as answer:
-            return dict(json.load(answer)["M0"])
-
-    def until(kind: str, count: int) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        path = folder / "journal.jsonl"
-        while not path.exists() or path.read_bytes().count(kind.encode()) < count:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-
-    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.4"]) as device:
-        bench = Bench(device, folder, LOST, ["safety.controller_patience=1"])
-        until("handed over to the on-board regulation earlier in this run", 1)
-        bench.client.kill()
-        bench.end()
-        time.sleep(2.0 * 60.0 / SPEED)
-        rows = len(read_journal(folder / "journal.jsonl")[0])
-        bench = Bench(device, folder, resume=True)
-        until("earlier in this run: left to it", 1)
-        time.sleep(3.0 * 60.0 / SPEED)
-        bench.client.terminate()
-        status, said = bench.end()
-        assert status == 0, said
-        assert "pumps verified off; M0: left to the on-board regulation" in said
-        assert od(device)["od"] == pytest.approx(0.4, abs=0.1)
-    later = [r for r in read_journal(folder / "journal.jsonl")[0][rows:] if r.get("reactor") == "M0"]
-    assert not [r for r in later if r["kind"] == "intent" or "/OD/" in r.get("path", "")]
-    assert [r for r in later if r["kind"] == "sample"]

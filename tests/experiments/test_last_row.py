@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.control import run as control
 from experiments.record.record import Record
 from experiments.record.summary import ChangeLog
 from hardware.emulator.faults import inject
@@ -58,6 +59,19 @@ def test_a_recording_that_is_deleted_in_a_run_is_one_line_at_its_end(tmp_path: P
     with pytest.raises(RecordingError, match=r"M0\.csv"):
         run.record.complete()
     assert len(run.record.rows[0]) == rows  # for figure and summary
+    run.close()
+
+
+def test_an_exception_in_the_controller_ends_the_run_with_its_pumps_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def act(*given: object) -> None:
+        raise RuntimeError("a bug")
+
+    run = in_a_dose(tmp_path, "M0")
+    monkeypatch.setattr(run.loop.density.law, "act", act)
+    assert control._run(run.loop, run.record, lambda *_: None) == "failed: RuntimeError: a bug"
+    assert not any(run.truth("M0")["motors"].values())
     run.close()
 
 

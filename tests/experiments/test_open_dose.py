@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.laws.base import Array, Mask
 from experiments.loop.loop import Step
 from experiments.record.record import Record
 from hardware.emulator.faults import inject
@@ -15,30 +14,34 @@ from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import SwitchedOff
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.hardware.driver_lab import Law
 from tests.hardware.emulator_lab import quiet
 
 FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"
 TARGET = "/SetOutputTarget/Pump1/M0/"
 
 
-class Full:
-    """A controller that always asks for the largest rate."""
+class Full(Rehearsal):
+    """A run whose controller always asks for the largest rate."""
 
-    def reset(self, n: int) -> None:
-        """Nothing to forget."""
+    def __init__(self, folder: Path, *names: str) -> None:
+        schedule = Scenario((0.5,), (600.0,), (37.0,))
+        super().__init__(folder, rehearsed(names or ("M0",), schedule), quiet(mu=0.03), od=0.8)
 
-    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        return np.full(od.shape, 0.02)
+    def begin(self) -> None:
+        super().begin()
+        self.loop.density.law = law = Law()
+        law.rate = 0.02
 
 
-class Cut(Rehearsal):
+class Cut(Full):
     """One reactor at full feed; the program ends at the first request of a kind after some minutes.
 
     how: "kill", or "stop" as on a signal.
     """
 
     def __init__(self, folder: Path, request: str, how: str = "kill") -> None:
-        super().__init__(folder, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+        super().__init__(folder)
         self._request, self._how, self._whole = request, how, self.device.submit
         self.begin()
         with pytest.raises((Killed, KeyboardInterrupt)):
@@ -47,10 +50,6 @@ class Cut(Rehearsal):
             self.reactors.stop()
         self.died_s = self.clock.now()
         self.close()
-
-    def begin(self) -> None:
-        super().begin()
-        self.loop.density.law = Full()
 
     def _until_cut(self) -> None:
         for _ in self.run(300.0):
@@ -91,9 +90,8 @@ class Cut(Rehearsal):
 
 def in_a_dose(folder: Path, *names: str) -> Rehearsal:
     """A run after some minutes at full feed, the feed pump of M0 on."""
-    run = Rehearsal(folder, rehearsed(names, Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run = Full(folder, *names)
     run.begin()
-    run.loop.density.law = Full()
     for _ in run.run(300.0):
         pass
     while not run.device.apps["M0"].data["Pump1"]["ON"]:
@@ -217,9 +215,8 @@ def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(
 
 def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Path) -> None:
     """The row comes with the feed pump's start, the end half a second later."""
-    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run = Full(tmp_path)
     run.begin()
-    run.loop.density.law = Full()
     steps = [step for step in run.run(300.0) if step.rows[0]]
     assert run.device.apps["M0"].data["Pump1"]["ON"]
     run.clock.sleep(0.6)
@@ -260,32 +257,3 @@ def test_repeats_before_a_board_agent_ended_them_are_booked(
     else:
         assert "repeated up to 2 times by the device" in run.note()
         assert -0.6 < run.off_by_ml() < 1.8  # every repetition, and at most one that the agent was quicker than
-
-
-def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(tmp_path: Path) -> None:
-    run = in_a_dose(tmp_path, "M0", "M1")
-    inject(run.device, "lost_request", "all", -1)
-    end = run.clock.now() + 600.0
-    for _ in run.run(end):
-        pass
-    inject(run.device, "lost_request", "all", 0)
-    steps = [step for step in run.run(end + 300.0) if step.rows[0]]
-    assert "falls" not in reasons(steps)
-    assert "budget" not in reasons(steps)
-    fed = run.loop.interlock.budget.fed_ml[0]
-    assert fed - run.truth("M0")["feed_ml"] == pytest.approx(0.0, abs=1.5)
-    assert (
-        any("repeated" in row["note"] for row in run.record.journal.rows or [] if row["kind"] == "note") or fed > 15.0
-    )
-
-
-def test_a_device_that_was_restarted_in_a_dose_repeated_nothing(tmp_path: Path) -> None:
-    run = in_a_dose(tmp_path, "M0")
-    inject(run.device, "power_cut")
-    for _ in run.run(run.clock.now() + 900.0):
-        pass
-    inject(run.device, "restart")
-    for _ in run.run(run.clock.now() + 300.0):
-        pass
-    run.wait(5.0)
-    assert float(run.loop.interlock.budget.fed_ml[0]) - run.truth("M0")["feed_ml"] < 1.5

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,6 @@ from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.extensions import light
 
-ROOT = Path(__file__).parents[2]
 HOLD = ("plant=coculture", "scenario=hold", "scenario.setpoints=[0.5]", "scenario.temperatures=[33.2]")
 WORDS = (*HOLD, "scenario.recovery_od=0", "scenario.minutes=[300]", "fsync=false")
 LIGHT = ("signals.light.kind=integral", "signals.light.setpoint=1400")
@@ -37,16 +34,6 @@ SCHEDULE = Scenario((0.5,), (80.0,), (33.2,))
 def rows(folder: Path) -> list[dict[str, str]]:
     with open(folder / "recordings" / "M0.csv", newline="", encoding="utf-8") as f:
         return list(csv.DictReader(f))
-
-
-@pytest.mark.slow
-def test_a_command_takes_it_from_a_file_outside(tmp_path: Path) -> None:
-    words = [f"extend={ROOT / 'tests' / 'extensions' / 'light.py'}", *WORDS, *LIGHT, "scenario.minutes=[5]"]
-    python = [sys.executable, "-m", "experiments.deploy", *words, "hydra.run.dir=here"]
-    done = subprocess.run(python, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert tuple(rows(tmp_path / "here")[0]) == (*USUAL, "light", "light_setpoint")
-    assert (tmp_path / "here" / "extensions" / "light.py").is_file()
 
 
 @pytest.mark.slow
