@@ -1,6 +1,7 @@
 """One reactor's verified conversation, played from a script of (request, answer) pairs."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -8,13 +9,23 @@ import pytest
 from hardware.chibio.connection import Connection
 from hardware.chibio.protocol import Permitted
 from hardware.clock import VirtualClock
-from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError
+from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Reply
 from tests.hardware.script import DONE, LOST, Script, answer, posts, read, state
 
 OFF = [f"/SetOutputOn/{pump}/0/M0" for pump in ("Pump1", "Pump3", "Pump4", "Pump2")]
 PROBE = "/MeasureTemp/IR/M0"
 Steps = Sequence[tuple[str, Reply | Exception]]
+Act = tuple[Any, ...]  # error or None, its words, method, arguments
+LOOK, NO_M0 = "GET /getSysdata/", {"M0": 0, "M1": 1}
+HERE, GONE = (LOOK, answer(state("M1"))), (LOOK, answer(state("M1", presentDevices=NO_M0)))
+ABSENT, UNSEEN = (DeviceStateError, "absent"), (DeviceStateError, "not seen present", "post")
+READ, SENT, PAUSE, ALL_OFF = (
+    (None, "", "read"),
+    (None, "", "post", OFF[0]),
+    (None, "", "sleep", 3.0),
+    (None, "", "pumps_off"),
+)
 
 
 def connection(steps: Steps, log: list[Any] | None = None) -> tuple[Connection, Script]:
@@ -25,126 +36,83 @@ def connection(steps: Steps, log: list[Any] | None = None) -> tuple[Connection, 
     ), script
 
 
-def test_a_read_is_a_pair_and_pins_the_identity() -> None:
-    m0, script = connection(read(state()) + read(state(DeviceID="other")))
-    assert m0.read().cycles == 1
-    assert m0.device_id == state()["DeviceID"]
-    with pytest.raises(IdentityError, match="pinned"):
-        m0.read()
-    with pytest.raises(DeviceStateError, match="not seen present"):
-        m0.post(OFF[0])  # whatever stands there now is not ours
-    script.close()
+def after_a_refusal(refusal: Reply | Exception) -> tuple[Steps, list[Act]]:
+    """A command is refused, once while the reactor is there, and once before a look finds it gone."""
+    steps = [*read(state()), (f"POST {OFF[0]}", refusal), HERE, *posts(OFF[1], OFF[2])]
+    steps += [(f"POST {OFF[3]}", refusal), (LOOK, refusal), GONE]
+    error = (ReactorError, "no answer|status 502", "post")
+    posted = [(None, "", "post", path) for path in OFF[1:3]]
+    return steps, [
+        READ,
+        (*error, OFF[0]),
+        *posted,
+        *(2 * [(*error, OFF[3])]),
+        (*ABSENT, "post", OFF[3]),
+        (*UNSEEN, OFF[3]),
+    ]
 
 
-def test_another_clients_selection_means_the_pair_is_repeated() -> None:
-    m0, script = connection(read(state("M1")) + read(state("M1")) + read(state()))
-    assert m0.read().selected == "M0"
-    script.close()
+CASES: dict[str, tuple[Steps, list[Act]]] = {
+    "another unit at this position, and whatever stands there now is not ours": (
+        read(state()) + read(state(DeviceID="other")),
+        [READ, (IdentityError, "pinned", "read"), (*UNSEEN, OFF[0])],
+    ),
+    "another client's selection: the pair is repeated": (2 * read(state("M1")) + read(state()), [READ]),
+    "a client that keeps selecting": (3 * read(state("M1")), [(DeviceStateError, "another client", "read")]),
+    "absent": (read(state(presentDevices=NO_M0)), [(*ABSENT, "read"), *((*UNSEEN, path) for path in OFF)]),
+    "before the first read": ([], [(*UNSEEN, OFF[0])]),
+    "no identity": (read(state(DeviceID="")), [(IdentityError, "none", "read")]),
+    "a lost answer: presence is looked at before the next command": after_a_refusal(LOST),
+    "a board agent without a server: alike": after_a_refusal(Reply(502, b"the board agent finds no server")),
+    "a while without a request: presence is looked at before the next command": (
+        [*read(state()), *posts(OFF[0]), HERE, *posts(OFF[1], OFF[2]), GONE],
+        [READ, SENT, PAUSE, (None, "", "post", OFF[1]), (None, "", "post", OFF[2]), PAUSE, (*ABSENT, "post", OFF[3])],
+    ),
+    **{
+        f"a post answered by {status}": (
+            [*read(state()), (f"POST {OFF[0]}", Reply(status, b"<html>"))],
+            [READ, (ProtocolError, words, "switch", "Pump1", False)],
+        )
+        for status, words in ((500, "status 500"), (403, "X-Requested-With"), (200, "expected 204"))
+    },
+    "pumps off touches the bus and reads back": (
+        [*read(state()), *posts(*OFF, PROBE), *read(state())],
+        [READ, ALL_OFF],
+    ),
+    "every pump is tried although one request is lost, but for the waste pump, and then all again": (
+        [*read(state()), (f"POST {OFF[0]}", LOST), HERE, *posts(*OFF[1:3], *OFF, PROBE), *read(state())],
+        [READ, ALL_OFF],
+    ),
+    "a pump that stays on, after three rounds": (
+        [*read(state()), *(3 * [*posts(*OFF, PROBE), *read(state(Pump2__ON=1))])],
+        [READ, (DeviceStateError, "Pump2 still on", "pumps_off")],
+    ),
+    "a hung bus is not verified off whatever the flags say": (
+        [*read(state()), *posts(*OFF), (f"POST {PROBE}", LOST)],
+        [READ, (LinkError, "no answer", "pumps_off", 1)],
+    ),
+    "a dead link: given up after two time-outs until the next try": (
+        [*read(state()), (f"POST {OFF[0]}", LOST), (LOOK, LOST)],
+        [READ, (LinkError, "no answer", "pumps_off", 1)],
+    ),
+    "a command outside the limits": (
+        read(state()),
+        [READ, (DeviceStateError, "refused", "switch", "Heat", True)]
+        + [
+            (DeviceStateError, "refused", "target", item, value)
+            for item, value in (("Pump1", 0.06), ("Pump2", 0.6), ("Thermostat", 50.0), ("UV", 0.5))
+        ],
+    ),
+}
 
 
-def test_a_client_that_keeps_selecting_is_named() -> None:
-    m0, script = connection(3 * read(state("M1")))
-    with pytest.raises(DeviceStateError, match="another client"):
-        m0.read()
-    script.close()
-
-
-def test_nothing_is_sent_to_a_reactor_that_is_absent() -> None:
-    m0, script = connection(read(state(presentDevices={"M0": 0, "M1": 1})))
-    with pytest.raises(DeviceStateError, match="absent"):
-        m0.read()
-    for path in OFF:
-        with pytest.raises(DeviceStateError, match="not seen present"):
-            m0.post(path)
-    script.close()
-
-
-def test_nothing_is_sent_before_the_first_read() -> None:
-    m0, _ = connection([])
-    with pytest.raises(DeviceStateError, match="not seen present"):
-        m0.switch("Pump1", False)
-
-
-@pytest.mark.parametrize("refusal", [LOST, Reply(502, b"the board agent finds no server")])
-def test_after_a_lost_answer_presence_is_looked_at_before_the_next_command(refusal: Reply | Exception) -> None:
-    gone, here, look = answer(state("M1", presentDevices={"M0": 0, "M1": 1})), answer(state("M1")), "GET /getSysdata/"
-    steps = [*read(state()), (f"POST {OFF[0]}", refusal), (look, here), *posts(OFF[1], OFF[2])]
-    m0, script = connection([*steps, (f"POST {OFF[3]}", refusal), (look, refusal), (look, gone)])
-    m0.read()
-    with pytest.raises((LinkError, ProtocolError)):
-        m0.post(OFF[0])
-    m0.post(OFF[1])
-    m0.post(OFF[2])
-    for _ in range(2):
-        with pytest.raises((LinkError, ProtocolError)):
-            m0.post(OFF[3])
-    with pytest.raises(DeviceStateError, match="absent"):
-        m0.post(OFF[3])
-    with pytest.raises(DeviceStateError, match="not seen present"):
-        m0.post(OFF[3])
-    script.close()
-
-
-def test_after_a_while_without_a_request_presence_is_looked_at_before_the_next_command() -> None:
-    gone, here, look = answer(state("M1", presentDevices={"M0": 0, "M1": 1})), answer(state("M1")), "GET /getSysdata/"
-    clock = VirtualClock()
-    script = Script([*read(state()), *posts(OFF[0]), (look, here), *posts(OFF[1], OFF[2]), (look, gone)])
-    m0 = Connection("M0", Permitted(("M0", "M1")), script, clock, lambda kind, fields: None)
-    m0.read()
-    m0.post(OFF[0])
-    clock.sleep(3.0)
-    m0.post(OFF[1])
-    m0.post(OFF[2])
-    clock.sleep(3.0)
-    with pytest.raises(DeviceStateError, match="absent"):
-        m0.post(OFF[3])
-    script.close()
-
-
-def test_no_identity_is_no_reactor() -> None:
-    m0, _ = connection(read(state(DeviceID="")))
-    with pytest.raises(IdentityError):
-        m0.read()
-
-
-@pytest.mark.parametrize(("status", "words"), [(500, "status 500"), (403, "X-Requested-With"), (200, "expected 204")])
-def test_a_post_is_answered_by_204_or_not_believed(status: int, words: str) -> None:
-    m0, _ = connection([*read(state()), (f"POST {OFF[0]}", Reply(status, b"<html>"))])
-    m0.read()
-    with pytest.raises(ProtocolError, match=words):
-        m0.switch("Pump1", False)
-
-
-def test_pumps_off_touches_the_bus_and_reads_back() -> None:
-    m0, script = connection([*read(state()), *posts(*OFF, PROBE), *read(state())])
-    m0.read()
-    m0.pumps_off()
-    script.close()
-
-
-def test_pumps_off_tries_every_pump_even_when_one_request_is_lost_and_then_all_again() -> None:
-    """But for the waste pump, which goes on as long as a feed pump may run."""
-    lost: Steps = [(f"POST {OFF[0]}", LOST), ("GET /getSysdata/", answer(state())), *posts(*OFF[1:3])]
-    m0, script = connection([*read(state()), *lost, *posts(*OFF, PROBE), *read(state())])
-    m0.read()
-    m0.pumps_off()
-    script.close()
-
-
-def test_a_pump_that_stays_on_is_reported_after_three_rounds() -> None:
-    on = state(Pump2__ON=1)
-    m0, script = connection([*read(state()), *(3 * [*posts(*OFF, PROBE), *read(on)])])
-    m0.read()
-    with pytest.raises(DeviceStateError, match="Pump2 still on"):
-        m0.pumps_off()
-    script.close()
-
-
-def test_a_hung_bus_is_not_verified_off_whatever_the_flags_say() -> None:
-    m0, script = connection([*read(state()), *posts(*OFF), (f"POST {PROBE}", LOST)])
-    m0.read()
-    with pytest.raises(LinkError):
-        m0.pumps_off(tries=1)
+@pytest.mark.parametrize("case", CASES)
+def test_each_request_and_each_refusal_in_its_order(case: str) -> None:
+    steps, acts = CASES[case]
+    m0, script = connection(steps)
+    for error, words, method, *arguments in acts:
+        with pytest.raises(error, match=words) if error else nullcontext():
+            (m0.clock.sleep if method == "sleep" else getattr(m0, method))(*arguments)
     script.close()
 
 
@@ -160,17 +128,6 @@ def test_every_command_and_its_answer_are_logged() -> None:
     ]  # fmt: skip
 
 
-def test_a_command_outside_the_limits_never_reaches_the_wire() -> None:
-    m0, script = connection(read(state()))
-    m0.read()
-    for item, value in (("Pump1", 0.06), ("Pump2", 0.6), ("Thermostat", 50.0), ("UV", 0.5)):
-        with pytest.raises(DeviceStateError, match="refused"):
-            m0.target(item, value)
-    with pytest.raises(DeviceStateError, match="refused"):
-        m0.switch("Heat", True)
-    script.close()
-
-
 def test_a_state_that_is_not_readable_is_no_state() -> None:
     m0, _ = connection([("POST /changeDevice/M0", DONE), ("GET /getSysdata/", Reply(200, b"{"))])
     with pytest.raises(ProtocolError):
@@ -179,14 +136,6 @@ def test_a_state_that_is_not_readable_is_no_state() -> None:
     m0, _ = connection([("POST /changeDevice/M0", DONE), ("GET /getSysdata/", Reply(500, answer(state()).body))])
     with pytest.raises(ProtocolError, match="status 500"):
         m0.read()
-
-
-def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_the_next_try() -> None:
-    m0, script = connection([*read(state()), (f"POST {OFF[0]}", LOST), ("GET /getSysdata/", LOST)])
-    m0.read()
-    with pytest.raises(LinkError):
-        m0.pumps_off(tries=1)
-    script.close()
 
 
 def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
