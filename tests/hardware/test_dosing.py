@@ -25,14 +25,6 @@ from hardware.errors import UnfitError
 CONFIG = DosingConfig()
 
 
-def test_volume_and_on_time_by_hand() -> None:
-    pump = PumpCalibration(flow_ml_s=0.8, bias_s=0.1)
-    assert pump.on_time(0.8) == pytest.approx(0.9)
-    assert pump.volume(0.9) == pytest.approx(0.8)
-    assert pump.min_dose_ml == pytest.approx(0.8 * 0.4)
-    assert pump.volume(0.0) == 0.0
-
-
 def test_every_fifth_dose_clears_the_waste_tube() -> None:
     duties = [plan_dose(0.01, 0.0, k, ReactorCalibration(), CONFIG).waste_duty for k in range(10)]
     assert [d == pytest.approx(0.25) for d in duties] == [k % 5 == 4 for k in range(10)]
@@ -65,6 +57,8 @@ NOMINAL = PumpCalibration()
         (0.01, 0.0, 0, NOMINAL, NOMINAL, 0.6, 4.0 * 0.6 + 4.4, (0.0, 0.0)),
         (0.005, 0.0, 0, NOMINAL, NOMINAL, 0.3, 5.6, (0.0, 0.0)),  # the smallest dose is a dose
         (0.00499, 0.0, 0, NOMINAL, NOMINAL, 0.0, 0.0, (0.2994, 0.0)),
+        (0.0053, 0.0, 0, PumpCalibration(0.8, 0.1), NOMINAL, 0.0, 0.0, (0.318, 0.0)),  # of 0.32 mL in 0.3 s
+        (0.0055, 0.0, 0, PumpCalibration(0.8, 0.1), NOMINAL, 0.3125, 5.65, (0.0, 0.0)),
         (0.00499, 0.2, 0, NOMINAL, NOMINAL, 0.4994, 6.3976, (0.0, 0.0)),
         (0.0, 0.5, 0, NOMINAL, NOMINAL, 0.0, 0.0, (0.3, 0.0)),  # no more is kept than one smallest dose
         (0.01, 0.0, 4, NOMINAL, NOMINAL, 0.6, 15.75, (0.0, 0.0)),
@@ -109,6 +103,8 @@ def test_a_pump_nobody_weighed() -> None:
     weighed = PumpCalibration(date="2026-02-03")
     pairs = ((NOMINAL, NOMINAL), (weighed, NOMINAL), (NOMINAL, weighed), (weighed, weighed))
     assert [ReactorCalibration(*pair).calibrated for pair in pairs] == [False, False, False, True]
+    assert PumpCalibration(0.8, 0.1).volume(0.9) == pytest.approx(0.8)
+    assert PumpCalibration(0.8, 0.1).volume(0.0) == 0.0
     assert PumpCalibration(bias_s=-0.5).volume(0.2) == 0.0
     assert PumpCalibration(bias_s=0.5).on_time(0.2) == 0.0
     assert PumpCalibration(bias_s=0.5).volume(-0.1) == 0.0

@@ -10,6 +10,7 @@ from envs.bench import Bench
 from envs.scenario import Scenario
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
+from hardware.emulator.device import DeviceOptions
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
 from tests.campaigns.rehearsal import SOUND
@@ -37,6 +38,8 @@ def test_three_reactors_are_held_without_a_missed_or_doubled_minute() -> None:
     assert np.all(lab.samples >= 14)
     begins = [t for t, path in lab.wire.posts if path.startswith("/Experiment/1")]
     assert np.diff(begins) == pytest.approx([20.0, 20.0], abs=1.5)
+    waits = [row["note"].split(",")[0] for row in lab.of("note")][:2]
+    assert waits == ["its experiment starts in 20 s", "its experiment starts in 40 s"]
     assert np.abs(np.array([step.od for step in lab.steps[-20:]]) - 0.5).mean() < 0.01
     for i, name in enumerate(lab.names):
         starts = [t for t, _ in doses(lab, name)]
@@ -56,22 +59,21 @@ def test_three_reactors_are_held_without_a_missed_or_doubled_minute() -> None:
     assert "undosed" not in lab.kinds()
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.4, 0.6, 0.9])
-def test_a_slow_link_does_not_cut_doses_short(delay_s: float) -> None:
-    lab = begun(options=quiet(), rate=0.01)
-    lab.fault("slow_s", delay_s)
+LATE = quiet(pump_start_low_s=0.2, pump_start_high_s=0.7)
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "rate", "slow_s"),
+    [*((("M0",), quiet(), 0.01, slow_s) for slow_s in (0.0, 0.4, 0.6, 0.9)), (("M0", "M1", "M2"), LATE, 0.02, 0.0)],
+)
+def test_motors_run_their_whole_dose_and_the_waste_before_fluid_comes_and_until_after_it(
+    names: tuple[str, ...], options: DeviceOptions, rate: float, slow_s: float
+) -> None:
+    """Over a slow link, and where each starts 0.2 to 0.7 s after its answer, drawn anew."""
+    lab = begun(names, options=options, rate=rate)
+    lab.fault("slow_s", slow_s)
     lab.run(10)
-    for pump, asked in (("Pump1", [0.54] * 20), ("Pump2", ([4.0 * 0.54 + 4.4] * 4 + [63.0 * 0.25]) * 4)):
-        given = doses(lab, pump=pump)
-        assert len(given) >= 9
-        assert [length for _, length in given] == pytest.approx([s + BIAS_S for s in asked[: len(given)]], abs=0.01)
-
-
-def test_late_motors_run_their_whole_dose_and_the_waste_before_fluid_comes_and_until_after_it() -> None:
-    """Each starts 0.2 to 0.7 s after its answer, drawn anew; a bus that dies in a feed must find the waste running."""
-    late = quiet(pump_start_low_s=0.2, pump_start_high_s=0.7)
-    lab = begun(("M0", "M1", "M2"), options=late, rate=0.02, minutes=10)
-    for name in lab.names:
+    for name in names:
         feeds, wastes = doses(lab, name), doses(lab, name, "Pump2")
         assert len(feeds) >= 8
         for (feed_s, feed), (waste_s, waste) in zip(feeds, wastes, strict=False):
@@ -79,7 +81,7 @@ def test_late_motors_run_their_whole_dose_and_the_waste_before_fluid_comes_and_u
         asked = [row for row in lab.of("intent") if row["reactor"] == name]
         for given, key in ((feeds, "feed_duty"), (wastes, "waste_duty")):
             expected = [63.0 * row[key] + BIAS_S for row in asked[: len(given)]]
-            assert [length for _, length in given] == pytest.approx(expected, abs=1e-3)
+            assert [length for _, length in given] == pytest.approx(expected, abs=0.01)
         assert lab.truth(name)["peak_ml"] < 20.0 + 1e-6
 
 
@@ -94,22 +96,6 @@ def test_doses_of_several_reactors_overlap() -> None:
     running = [doses(lab, name, "Pump2")[-1] for name in lab.names]
     ends = [start + length for start, length in running]
     assert min(ends) > max(start for start, _ in running)
-
-
-def test_no_forbidden_request_in_a_run_with_every_trouble() -> None:
-    lab = begun(("M0", "M1"))
-    for name, value in (("lost_reply", 3), ("worker_wipe", 1), ("cycle_dead", 1), ("foreign_selects", 0.2)):
-        lab.run(5)
-        lab.fault(name, value)
-    lab.run(10)
-    lab.fault("foreign_selects", 0)
-    lab.reactors.stop()
-    words = {path.split("/")[1] for _, path in lab.wire.posts}
-    assert words == {
-        "changeDevice", "SetOutputTarget", "SetOutputOn", "CalibrateOD", "MeasureTemp", "Experiment",
-    }  # fmt: skip
-    targets = [float(p.split("/")[4]) for _, p in lab.wire.posts if p.startswith("/SetOutputTarget/Pump1")]
-    assert max(targets) <= 0.05
 
 
 # -- start -----------------------------------------------------------------------------------------------------------
@@ -140,19 +126,6 @@ def test_a_start_whose_answer_is_lost_is_not_repeated_before_the_state_was_read(
     lab.run(3)
     assert len([p for _, p in lab.wire.posts if p == "/Experiment/1/M0"]) == 1
     assert lab.samples[0] >= 2
-
-
-def test_a_start_soon_after_a_stop_waits_for_the_old_cycle() -> None:
-    lab = DriverLab()
-    lab.device.handle("POST", "/Experiment/1/M0")
-    lab.clock.sleep(90.0)
-    lab.device.handle("POST", "/Experiment/0/M0")
-    lab.reactors.begin()
-    lab.run(5)
-    data = lab.device.apps["M0"].data
-    assert data["Thermostat"]["ON"] == 1
-    assert data["Stir"]["ON"] == 1
-    assert not [row for row in lab.of("note") if "was off" in row["note"]]
 
 
 def test_a_thermostat_lost_to_the_restart_trap_is_switched_on_again() -> None:
@@ -190,11 +163,11 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
 
 
 @pytest.mark.parametrize("named", [0, 1])
-@pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True)])
+@pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True), (0.0, True)])
 def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_ended(
     named: int, rest_s: float, waits: bool
 ) -> None:
-    """Newer apps name the reactor in the line that says so."""
+    """Newer apps name the reactor in the line that says so. Before that its last cycle would end the new one's heat."""
     lab = DriverLab()
     lab.fault("terminal_named", named)
     lab.device.handle("POST", "/Experiment/1/M0")
@@ -204,9 +177,12 @@ def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_
     before = lab.clock.now()
     lab.reactors.begin()
     assert (lab.clock.now() - before > 65.0) is waits
+    assert any("waits 70 s" in row["note"] for row in lab.of("note")) is waits
     lab.run(3)
     assert lab.samples[0] >= 2
-    assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 1
+    data = lab.device.apps["M0"].data
+    assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
+    assert not [row for row in lab.of("note") if "was off" in row["note"]]
 
 
 def test_zigzag_is_refused_with_the_remedy() -> None:
@@ -258,23 +234,6 @@ def test_no_failed_request_doubles_a_dose_or_leaves_a_pump_on(fault: str, reques
     assert sum(length for _, length in given) <= receipt.volume_ml[0] + 0.1
     assert lab.motors_off()
     assert lab.of("dose_end")
-
-
-def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
-    """Ends of doses that time out again and again must not keep the loop from hearing of it."""
-    lab = begun(names=("M0", "M1"), minutes=3)
-    fixed(lab, 0.02)
-    while not lab.step().rows[0]:
-        pass
-    lab.fault("lost_request", -1)
-    began = lab.clock.now()
-    while "link" not in (lab.steps[-1].reasons[0] or ""):
-        lab.step()
-    assert lab.clock.now() - began < 60.0
-    lab.fault("lost_request", 0)
-    fixed(lab, 0.0)
-    lab.run(3)
-    assert lab.motors_off()
 
 
 def test_targets_changed_by_someone_are_set_back() -> None:
@@ -389,19 +348,6 @@ def test_a_device_started_again_without_one_of_its_reactors_is_not_ended_by_this
     assert (lab.samples - before)[1] == 0
 
 
-def test_a_dead_thread_is_restarted_and_the_neighbour_never_notices() -> None:
-    lab = begun(("M0", "M1"), minutes=5)
-    lab.fault("cycle_dead", 1, "M0")
-    before = lab.samples.copy()
-    lab.run(12)
-    got = lab.samples - before
-    assert got[1] >= 11
-    assert 6 <= got[0] <= 10
-    assert "stalled" in lab.kinds()
-    data = lab.device.apps["M0"].data
-    assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
-
-
 def test_an_experiment_that_this_program_ended_is_started_again_and_one_that_somebody_ended_is_not() -> None:
     lab = begun(("M0", "M1"), rate=0.02)
     while not [row for row in lab.of("feed_on") if row["reactor"] == "M0"]:
@@ -513,33 +459,23 @@ def test_end_stops_the_experiments_too() -> None:
     assert all(lab.device.apps[n].data["Experiment"]["ON"] == 0 for n in lab.names)
 
 
-def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
+@pytest.mark.parametrize("begun_dose", [False, True])
+def test_a_full_disk_prevents_a_dose_and_does_not_stand_in_the_way_of_pumps_off(begun_dose: bool) -> None:
+    """Full before the intent is written, or from the midst of a dose on."""
     lab = DriverLab()
-
-    def full(kind: str, fields: Any) -> None:
-        if kind == "intent":
-            raise RecordingError("journal: No space left on device")
-
-    lab.client(log=full)
     lab.reactors.begin()
-    m = lab.reactors.measure()
-    with pytest.raises(RecordingError):
-        lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
-    assert not doses(lab)
-    lab.reactors.stop()
-
-
-def test_a_full_disk_does_not_stand_in_the_way_of_pumps_off() -> None:
-    lab = begun(rate=0.02)
-    m = lab.reactors.measure()
-    lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    dose = Command(lab.reactors.measure().fresh, np.array([0.02]), np.array([37.0]))
+    if begun_dose:
+        lab.reactors.actuate(dose)
 
     def full(kind: str, fields: Any) -> None:
-        raise RecordingError("journal: No space left on device")
+        if begun_dose or kind == "intent":
+            raise RecordingError("journal: No space left on device")
 
     lab.reactors._log = full
     with pytest.raises(RecordingError):
-        lab.reactors.measure()
+        lab.reactors.measure() if begun_dose else lab.reactors.actuate(dose)
+    assert bool(doses(lab)) is begun_dose
     lab.reactors.stop()
     assert lab.motors_off()
 
