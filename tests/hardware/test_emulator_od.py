@@ -53,21 +53,22 @@ def test_a_zero_of_0_makes_every_measurement_raise_and_kills_the_cycle() -> None
     assert state["OD"]["record"] == []
 
 
-@pytest.mark.parametrize(("zero", "od"), [(65000.0, 14.06), (16000.0, 11.7)])
-def test_dead_spectrometer_reads_raw_1(zero: float, od: float) -> None:
-    lab = Lab()
+@pytest.mark.parametrize(
+    ("fault", "value", "zero", "raw", "od"),
+    [
+        ("spectrometer_dead", 1.0, 65000.0, 1.0, 14.06),
+        ("spectrometer_dead", 1.0, 16000.0, 1.0, 11.7),
+        ("spectrometer_dark", 1.0, 65000.0, 0.0, 0.0),
+        ("od_offset", -0.5, 65000.0, 65535.0, -0.0065),  # saturated at 16 bits
+    ],
+)
+def test_a_spectrometer_at_its_ends(fault: str, value: float, zero: float, raw: float, od: float) -> None:
+    lab = Lab(options=quiet(blank_low=60000.0, blank_high=60000.0), od=0.0)
     lab.post(f"/CalibrateOD/OD0/M0/{zero}/0")
-    inject(lab.device, "spectrometer_dead", "M0")
+    inject(lab.device, fault, "M0", value)
     assert lab.post("/MeasureOD/M0") == 204
-    assert lab.state()["OD0"]["raw"] == 1.0
-    assert lab.state()["OD"]["current"] == pytest.approx(od, abs=0.01)
-
-
-def test_dark_spectrometer_reads_od_0() -> None:
-    lab = Lab()
-    inject(lab.device, "spectrometer_dark", "M0")
-    lab.post("/MeasureOD/M0")
-    assert (lab.state()["OD0"]["raw"], lab.state()["OD"]["current"]) == (0.0, 0)
+    assert lab.state()["OD0"]["raw"] == raw
+    assert lab.state()["OD"]["current"] == pytest.approx(od, abs=1e-4 if abs(od) < 1.0 else 0.01)
 
 
 def test_one_bad_reading_of_four_shifts_the_mean_by_about_3() -> None:
@@ -80,13 +81,6 @@ def test_one_bad_reading_of_four_shifts_the_mean_by_about_3() -> None:
     r = np.log10(BLANK / 1.0)
     assert lab.state()["OD"]["record"][-1] == pytest.approx((B * r + A * r * r + 3 * 0.5) / 4, abs=0.01)
     assert lab.state()["OD"]["record"][-1] - 0.5 == pytest.approx(2.8, abs=0.3)
-
-
-def test_saturation_at_16_bits() -> None:
-    lab = Lab(options=quiet(blank_low=60000.0, blank_high=60000.0), od=0.0)
-    inject(lab.device, "od_offset", "M0", -0.5)
-    lab.post("/MeasureOD/M0")
-    assert lab.state()["OD0"]["raw"] == 65535.0
 
 
 def test_stirred_reading_is_several_times_smaller() -> None:
@@ -161,26 +155,6 @@ def test_thermometers() -> None:
         value = state[f"Thermometer{which}"]["current"]
         assert value * 16 == pytest.approx(round(value * 16))
         assert 20.0 < value < 30.0
-
-
-def test_heating_is_fast_cooling_is_slow_and_the_target_is_held() -> None:
-    lab = Lab(temperature=27.5)
-    lab.post("/SetOutputTarget/Thermostat/M0/37")
-    lab.post("/Experiment/1/M0")
-    lab.wait(7 * 60.0)
-    assert lab.device.truth("M0")["temperature"] > 35.0  # about 2 degC/min
-    lab.wait(1800.0)
-    held = []
-    for _ in range(20):
-        lab.wait(60.0)
-        held.append(lab.device.truth("M0")["temperature"])
-    assert np.mean(held) == pytest.approx(37.0, abs=0.3)
-    assert np.std(held) < 0.3
-    lab.post("/SetOutputTarget/Thermostat/M0/30")
-    start = lab.clock.now()
-    while lab.device.truth("M0")["temperature"] > 30.2:
-        lab.wait(10.0)
-    assert 20.0 < (lab.clock.now() - start) / 60.0 < 40.0  # 29 and 33 min measured
 
 
 def test_thermostat_step_by_hand() -> None:

@@ -185,23 +185,23 @@ def test_feed_dilutes_by_what_it_adds() -> None:
 
 @pytest.mark.parametrize(
     ("fault", "value", "delivered"),
-    [("pump_gain_factor", 0.0, 0.0), ("pump_gain_factor", 0.3, 0.3), ("media_left_ml", 0.5, 0.5)],
+    [
+        ("pump_gain_factor", 0.0, [0.0, 0.0]),
+        ("pump_gain_factor", 0.3, [0.3, 0.6]),
+        ("media_left_ml", 0.5, [0.5, 0.5]),
+        ("back_leak_ml", 0.2, [0.8, 1.6]),  # from every pulse
+    ],
 )
-def test_pump_faults_change_what_arrives_not_what_the_device_says(fault: str, value: float, delivered: float) -> None:
+def test_pump_faults_change_what_arrives_not_what_the_device_says(
+    fault: str, value: float, delivered: list[float]
+) -> None:
     lab = Lab()
     inject(lab.device, fault, "M0", value)
     lab.pump("Pump1", (1.0 - BIAS_S) / 63.0)
-    lab.wait(5.0)
-    assert lab.state()["Pump1"]["ON"] == 1
-    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(delivered)
-
-
-def test_back_leak_takes_from_every_pulse() -> None:
-    lab = Lab()
-    inject(lab.device, "back_leak_ml", "M0", 0.2)
-    lab.pump("Pump1", (1.0 - BIAS_S) / 63.0)
-    lab.wait(70.0)
-    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(2 * 0.8)
+    for seconds, ml in zip((5.0, 65.0), delivered, strict=True):
+        lab.wait(seconds)
+        assert lab.state()["Pump1"]["ON"] == 1
+        assert lab.device.truth("M0")["feed_ml"] == pytest.approx(ml)
 
 
 def test_stuck_open_pump_runs_although_the_device_says_off() -> None:

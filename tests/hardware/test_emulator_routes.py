@@ -93,12 +93,6 @@ def test_targets_are_clamped_nan_passes_and_comes_out_as_a_bare_token() -> None:
     assert math.isnan(json.loads(body)["Pump3"]["target"])
 
 
-def test_od0_is_stored_and_then_answers_500() -> None:
-    lab = Lab()
-    assert lab.post("/SetOutputTarget/OD0/M0/12345") == 500
-    assert lab.state()["OD0"]["target"] == 12345.0
-
-
 def test_force_is_on_off_and_anything_else_toggles() -> None:
     lab = Lab()
     lab.post("/SetOutputTarget/Pump1/M0/0.1")
@@ -107,20 +101,23 @@ def test_force_is_on_off_and_anything_else_toggles() -> None:
         assert lab.state()["Pump1"]["ON"] == on
 
 
-@pytest.mark.parametrize("item", ["Chemostat", "Custom", "Volume", "OD0"])
-def test_the_flag_of_what_drives_nothing_is_set_and_then_answers_500(item: str) -> None:
+@pytest.mark.parametrize(
+    ("path", "item", "key"),
+    [
+        ("SetOutputTarget/OD0/M0/{}", "OD0", "target"),
+        *(
+            (f"SetOutputOn/{item}/{{}}/M0", item, "ON")
+            for item in ("Chemostat", "Custom", "Volume", "OD0", "Experiment")
+        ),
+    ],
+)
+def test_what_drives_nothing_is_set_and_then_answers_500(path: str, item: str, key: str) -> None:
     lab = Lab()
-    for force in (1, 0):
-        assert lab.post(f"/SetOutputOn/{item}/{force}/M0") == 500
-        assert lab.state()[item]["ON"] == force
-
-
-def test_experiment_flag_set_through_set_output_starts_no_thread() -> None:
-    lab = Lab()
-    assert lab.post("/SetOutputOn/Experiment/1/M0") == 500
+    for value in (0, 1):
+        assert lab.post(f"/{path.format(value)}") == 500
+        assert lab.state()[item][key] == value
     lab.wait(200.0)
-    state = lab.state()
-    assert (state["Experiment"]["ON"], state["Experiment"]["cycles"]) == (1, 0)
+    assert lab.state()["Experiment"]["cycles"] == 0  # no thread was started
 
 
 def test_only_the_selected_reactor_is_served_and_an_absent_one_is_ignored() -> None:
@@ -146,25 +143,23 @@ def test_blanked_start_has_the_zero_an_operator_would_have_set() -> None:
         ("/MeasureOD/M0", 0.97),
         ("/GetSpectrum/x1/M0", 1.9),
         ("/SetOutputOn/Pump1/0/M0", 0.0),
-        ("/SetOutputTarget/Stir/M0/0.5", 0.0),  # off: nothing is switched
+        *((f"/SetOutputTarget/Stir/M0/{k}", s) for k, s in ((0.4, 1.5), (0.5, 2.25), (0.8, 2.25), (0.9, 3.0))),
     ],
 )
 def test_blocking_times(path: str, seconds: float) -> None:
+    """The stirrer blocks by its target, where it is switched on and where the target of one that is on is rewritten."""
     lab = Lab()
-    before = lab.clock.now()
-    lab.post(path)
-    assert lab.clock.now() - before == pytest.approx(seconds, abs=0.02)
 
-
-@pytest.mark.parametrize(("target", "seconds"), [(0.4, 1.5), (0.5, 2.25), (0.8, 2.25), (0.9, 3.0)])
-def test_stirrer_blocks_by_its_target_and_again_when_the_target_is_rewritten(target: float, seconds: float) -> None:
-    lab = Lab()
-    lab.post(f"/SetOutputTarget/Stir/M0/{target}")
-    for path in ("/SetOutputOn/Stir/1/M0", f"/SetOutputTarget/Stir/M0/{target}"):
+    def taken(path: str) -> float:
         before = lab.clock.now()
         lab.post(path)
-        assert lab.clock.now() - before == pytest.approx(seconds, abs=0.02)
-    assert lab.device.vials["M0"].stir == target
+        return lab.clock.now() - before
+
+    stirs = "Stir" in path
+    assert taken(path) == pytest.approx(0.0 if stirs else seconds, abs=0.02)
+    if stirs:
+        assert [taken("/SetOutputOn/Stir/1/M0"), taken(path)] == pytest.approx([seconds] * 2, abs=0.02)
+        assert lab.device.vials["M0"].stir == float(path.rpartition("/")[2])
 
 
 def test_switching_regulation_either_way_turns_both_pumps_off() -> None:
