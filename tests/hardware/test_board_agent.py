@@ -490,6 +490,12 @@ def test_regulating_reactor_is_left_alone_the_other_is_not(short: AgentLab) -> N
     short.until(lambda: "M1/Pump1" not in short.motors() and "verified off" in short.log.read_text())
     assert "M0/Pump3" in short.motors()
     assert "M0 regulates on its own" in short.log.read_text()
+    hello = json.loads(short.ask("HELLO", "/")[1])
+    assert hello["trips"] == 1
+    assert hello["silent_s"] > 1.0
+    assert hello["last_trip"].startswith("20")
+    assert {m: list(pumps) for m, pumps in hello["switched_off"].items()} == {"M1": ["Pump1"]}
+    assert 0.0 <= hello["switched_off"]["M1"]["Pump1"] < 10.0
 
 
 @pytest.mark.slow
