@@ -6,7 +6,7 @@ import resource
 import signal
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,13 @@ OTHERS = (signal.SIGINT, 0.0), (signal.SIGHUP, 0.0), (signal.SIGTERM, 6.0)  # 0.
 class Bench:
     """A client at work on two reactors of an emulated device."""
 
-    def __init__(self, device: EmulatorProcess, folder: Path, more: Sequence[str] = (), resume: bool = False) -> None:
+    def __init__(self, device: EmulatorProcess, folder: Path) -> None:
         self.device, self.folder = device, folder
         scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]"]
         backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
-        new = ["controller=adaptive_inverse", *scenario, *backend, *more, f"hydra.run.dir={folder}"]
-        words = [f"resume={folder}"] if resume else new
-        self.client = Program(
-            "experiments.deploy", *words, cwd=folder.parent, out=folder.with_suffix(".out"), WITHOUT_FIGURES="1"
-        )
+        words = ["controller=adaptive_inverse", *scenario, *backend, f"hydra.run.dir={folder}"]
+        out = folder.with_suffix(".out")
+        self.client = Program("experiments.deploy", *words, cwd=folder.parent, out=out, WITHOUT_FIGURES="1")
 
     def truth(self) -> dict[str, Any]:
         with urllib.request.urlopen(f"{self.device.control}/_emulator/truth", timeout=10.0) as answer:
@@ -142,31 +140,3 @@ def test_a_full_disk(bench: Bench) -> None:
     assert "free disk space, then resume the run" in said.splitlines()[-1]
     assert bench.motors() == []
     assert read_journal(bench.folder / "journal.jsonl")[1] == 0
-
-
-@pytest.mark.slow
-def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_other_end(tmp_path: Path) -> None:
-    pump = ["backend.overflow_pump.pump=Pump3", "backend.overflow_pump.duty=0.95"]
-    folder = tmp_path / "run"
-    state = folder / "state.json"
-
-    def until_fed(bench: Bench) -> None:
-        """Until each reactor has a row and a dose is given beside a running overflow pump."""
-        both = [{f"{name}/Pump1", f"{name}/Pump3"} for name in ("M0", "M1")]
-        bench.client.until(lambda: state.exists() and all(volumes(folder, name) for name in ("M0", "M1")))
-        bench.client.until(lambda: any(pumps <= set(bench.motors()) for pumps in both))
-
-    with EmulatorProcess(
-        ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]
-    ) as device:
-        bench = Bench(device, folder, more=pump)
-        until_fed(bench)
-        bench.client.kill()
-        assert "overflow pump: Pump3 at duty 0.95" in bench.end()[1]
-        bench = Bench(device, folder, resume=True)
-        until_fed(bench)
-        bench.client.send_signal(signal.SIGTERM)
-        status, said = bench.end()
-        assert status == 0, said
-        assert "pumps verified off" in said
-        bench.check("stopped by the operator")

@@ -129,36 +129,28 @@ def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobod
 
 
 @pytest.mark.slow
-def test_they_are_booked_once_however_often_the_program_dies(tmp_path: Path) -> None:
-    run = Cut(tmp_path, FEED_ON)
-    run.wait(500.0)
-    run.begin()  # dies again before its first sample
-    run.close()
-    run.wait(100.0)
-    steps = run.resumed()
-    assert "overflow" not in reasons(steps)  # what the waste pump took out with each of them is booked too
-    assert run.loop.interlock.budget.volume_ml[0] < 20.0 + 1.3
-    assert run.loop.interlock.budget._hour[0].max() < 2.5  # each in the minute in which it was given
-    assert abs(run.off_by_ml()) < 1.0
-    assert "left open" in run.note()
-    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
-
-
-@pytest.mark.slow
-def test_a_repeat_that_stands_in_a_row_already_is_in_no_second_one(tmp_path: Path) -> None:
-    """The second life decides with the repeats booked, and dies before it can save that it has."""
+@pytest.mark.parametrize("decides", [False, True])
+def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_dies(
+    tmp_path: Path, decides: bool
+) -> None:
+    """Again before its first sample, or when it has decided with the repeats booked and not yet saved that it has."""
     run = Cut(tmp_path, FEED_ON)
     run.wait(500.0)
     run.begin()
-    run._request, run.device.submit = TARGET, run._cut  # type: ignore[method-assign]
-    with pytest.raises(Killed):
-        for _ in run.run(run.clock.now() + 300.0):
-            pass
+    if decides:
+        run._request, run.device.submit = TARGET, run._cut  # type: ignore[method-assign]
+        with pytest.raises(Killed):
+            for _ in run.run(run.clock.now() + 300.0):
+                pass
     run.close()
     run.wait(100.0)
-    run.resumed()
-    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+    steps, budget = run.resumed(), run.loop.interlock.budget
+    assert "overflow" not in reasons(steps)  # what the waste pump took out with each of them is booked too
+    assert budget.volume_ml[0] < 20.0 + 1.3
+    assert budget._hour[0].max() < 2.5  # each in the minute in which it was given
     assert abs(run.off_by_ml()) < 1.0
+    assert "left open" in "".join(str(row["note"]) for row in run.journal("note"))
+    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(budget.fed_ml[0]))
 
 
 @pytest.mark.parametrize("how", ["worker_wipe", "power_cut"])

@@ -56,7 +56,7 @@ def looked_at(url: str, folder: Path) -> None:
     assemble.run_preflight(assemble.unpack(main.config(words(url, "preflight_only=true")), folder), folder)
 
 
-def test_its_preflight_samples_every_vial_and_verifies_the_pumps_off(
+def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_server_is_away(
     known: None, device: EvolverStub, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("INFO"):
@@ -65,17 +65,11 @@ def test_its_preflight_samples_every_vial_and_verifies_the_pumps_off(
     assert sum("pass  v" in line and " sample: OD 0." in line for line in said) == VIALS
     assert said.count("pass  v3 pumps: verified off") == 1
     assert not device.fed_ml.any()
-
-
-def test_its_preflight_fails_where_the_server_is_away_or_a_pump_runs_on(
-    known: None, device: EvolverStub, tmp_path: Path
-) -> None:
-    away = rf"preflight: 1 of 1 checks failed, the first: FAIL  reactors: no answer from {AWAY}/off .*check cable"
-    with pytest.raises(frame.UserError, match=away):
-        looked_at(AWAY, tmp_path)
     device.stuck = {3}
-    with pytest.raises(frame.UserError, match="FAIL  reactors: v3: pumps still on; switch them off by hand"):
-        looked_at(device.url, tmp_path)
+    away = rf"1 of 1 checks failed, the first: FAIL  reactors: no answer from {AWAY}/off .*check cable"
+    for url, words in ((device.url, "FAIL  reactors: v3: pumps still on; switch them off by hand"), (AWAY, away)):
+        with pytest.raises(frame.UserError, match=words):
+            looked_at(url, tmp_path)
 
 
 @pytest.mark.parametrize(
