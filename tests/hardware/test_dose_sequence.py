@@ -294,60 +294,43 @@ def ended(bench: Bench) -> dict[str, Any]:
     return {key: round(end[key], 3) for key in keys}
 
 
-@pytest.mark.parametrize(("dead_s", "times"), [(60.0, 0), (65.0, 1), (123.0, 1), (128.0, 2)])
-def test_what_the_device_repeats_until_it_has_heard_the_end_is_told(dead_s: float, times: int) -> None:
-    """The pumps start at run time 1; nothing is heard from then on for so long."""
-    bench = Bench()
-    bench.begin()
-
-    def dead(path: str) -> None:
-        if bench.clock.now() < 1000.0 + dead_s:
-            raise LinkError("no answer")
-
-    bench.line.trouble = dead
-    bench.run()
-    whole = {"feed_ml": round(FEED_S, 3), "waste_ml": round(WASTE_S, 3), "on_s": 1.0}
-    assert ended(bench) == {**whole, "feed_times": times, "waste_times": times}
-    again = [(given.at_s, given.feed_ml) for given in bench.doses.extra if given.feed_ml > 0.0]
-    assert again == [(1.0 + 63.0 * k, pytest.approx(FEED_S)) for k in range(1, times + 1)]
-    assert ["was repeated" in note and f"{times} times" in note for note in bench.book.notes] == [True] * (times > 0)
-    assert bench.book.fault is not None
-
-
-def test_a_feed_pump_that_was_heard_to_be_off_repeats_nothing_while_the_waste_goes_on() -> None:
-    bench = Bench()
-    bench.begin()
-
-    def deaf(path: str) -> None:
-        if path == OFFS[1] and bench.clock.now() < 1130.0:
-            raise LinkError("no answer")
-
-    bench.line.trouble = deaf
-    bench.run(60.0)
-    assert bench.book.fault is not None
-    assert bench.book.fault.kind == "link"
-    bench.run()
-    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (0, 2)
-    assert bench.book.notes == []
+ELSEWHEN = {"Experiment__startTime": "2026-01-01 01:00:00"}
 
 
 @pytest.mark.parametrize(
-    ("shown", "until_then", "times"),
+    ("deaf", "deaf_s", "shown", "until_then", "times"),
     [
-        ({}, {"Pump1__ON": 1}, (2, 2)),  # the feed pump answers off and goes on; the waste pump goes on beside it
-        ({"Experiment__startTime": "2026-01-01 01:00:00"}, {"Pump1__ON": 1}, (0, 0)),  # restarted in the dose
+        *(("/", deaf_s, {}, {}, (k, k)) for deaf_s, k in ((60.0, 0), (65.0, 1), (123.0, 1), (128.0, 2))),
+        (OFFS[1], 130.0, {}, {}, (0, 2)),  # the feed pump was heard to be off
+        ("-", 0.0, {}, {"Pump1__ON": 1}, (2, 2)),  # it answers off and goes on; the waste pump goes on beside it
+        ("-", 0.0, ELSEWHEN, {"Pump1__ON": 1}, (0, 0)),  # restarted in the dose
     ],
 )
-def test_what_a_device_shows_after_a_dose_says_what_was_repeated(
-    shown: dict[str, Any], until_then: dict[str, Any], times: tuple[int, int]
+def test_what_the_device_repeats_until_the_end_is_heard_and_seen_is_told(
+    deaf: str, deaf_s: float, shown: dict[str, Any], until_then: dict[str, Any], times: tuple[int, int]
 ) -> None:
+    """The pumps start at run time 1; some requests are not heard for so long, or a pump is seen on for 130 s."""
     bench = Bench()
     bench.begin()
-    bench.line.shown = shown | until_then
-    bench.run(130.0)
+
+    def trouble(path: str) -> None:
+        if path.startswith(deaf) and bench.clock.now() < 1000.0 + deaf_s:
+            raise LinkError("no answer")
+
+    bench.line.trouble, bench.line.shown = trouble, shown | until_then
+    bench.run(60.0)
+    assert (bench.book.fault is not None and bench.book.fault.kind == "link") == (deaf_s >= 60.0)
+    bench.run(70.0)
     bench.line.shown = shown
     bench.run()
-    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == times
+    end = ended(bench)
+    assert (end["feed_times"], end["waste_times"]) == times
+    if not shown:
+        assert (end["feed_ml"], end["waste_ml"], end["on_s"]) == (round(FEED_S, 3), round(WASTE_S, 3), 1.0)
+    again = [(given.at_s, given.feed_ml) for given in bench.doses.extra if given.feed_ml > 0.0]
+    assert again == [(1.0 + 63.0 * k, pytest.approx(FEED_S)) for k in range(1, times[0] + 1)]
+    told = [note for note in bench.book.notes if "was repeated" in note]
+    assert [f"{times[0]} times" in note for note in told] == [True] * (times[0] > 0)
     assert any("restarted" in note for note in bench.book.notes) == bool(shown)
 
 

@@ -13,7 +13,6 @@ from hardware.chibio.reactors import ChiBioReactors
 from hardware.emulator.device import DeviceOptions
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
-from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.emulator_lab import BIAS_S, quiet
 
@@ -139,15 +138,6 @@ def test_a_thermostat_lost_to_the_restart_trap_is_switched_on_again() -> None:
     assert [row["note"] for row in lab.of("note") if "Thermostat was off" in row["note"]]
 
 
-def test_pumps_found_on_are_switched_off_before_anything_else() -> None:
-    lab = DriverLab()
-    for path in ("/SetOutputTarget/Pump1/M0/0.02", "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/OD/1/M0"):
-        lab.device.handle("POST", path)
-    lab.reactors.begin()
-    assert lab.motors_off()
-    assert lab.device.apps["M0"].data["OD"]["ON"] == 0
-
-
 @pytest.mark.parametrize("phase_s", [1.0, 6.0, 9.0, 30.0])
 def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over(phase_s: float) -> None:
     lab = DriverLab(od=0.6)
@@ -155,11 +145,14 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(4 * 60.07 + phase_s)
     assert doses(lab)
+    for path in ("/SetOutputTarget/Pump3/M0/0.02", "/SetOutputOn/Pump3/1/M0"):  # and one that it does not use
+        lab.device.handle("POST", path)
     taken_over = lab.clock.now()
     lab.reactors.begin()
     lab.clock.sleep(20.0)
     assert not [start for start, _ in doses(lab) if start > taken_over]
     assert lab.motors_off()
+    assert lab.device.apps["M0"].data["OD"]["ON"] == 0
 
 
 @pytest.mark.parametrize("named", [0, 1])
@@ -396,12 +389,12 @@ def test_the_hot_guard_switches_heating_off_for_good() -> None:
     assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 0
 
 
-def test_each_reactor_is_dosed_by_its_own_pumps_and_has_its_own_volume_and_blank() -> None:
+def test_each_reactor_is_dosed_by_its_own_pumps_and_has_its_own_volume_and_blank_and_the_run_s_heat() -> None:
     """0.6 mL of a pump of 0.8 mL/s take 0.75 s, of one of 1.2 mL/s 0.5 s; the waste pump 4 times that and 4.4 s."""
-    lab = DriverLab(("M0", "M3"), options=quiet())
+    lab = DriverLab(("M0", "M3"), options=quiet(), temperature=33.5, stir=0.7)
     weak = ReactorCalibration(PumpCalibration(flow_ml_s=0.8), PumpCalibration(flow_ml_s=1.5))
     strong = ReactorCalibration(PumpCalibration(flow_ml_s=1.2), PumpCalibration(flow_ml_s=0.9), blank=13000.0)
-    bench = Bench(volumes_ml={"M3": 15.0})
+    bench = Bench(volume_ml=18.0, volumes_ml={"M3": 15.0})
     reactors = ChiBioReactors(lab.wire, lab.clock, lab.config, [weak, strong], lab.log, bench)
     reactors.begin()
     waste_ml = np.zeros(2)
@@ -418,19 +411,11 @@ def test_each_reactor_is_dosed_by_its_own_pumps_and_has_its_own_volume_and_blank
         assert 63.0 * duties["Pump1"] == pytest.approx(feed_s, abs=1e-3)
         assert 63.0 * duties["Pump2"] == pytest.approx(4.0 * feed_s + 4.4, abs=1e-3)
         assert waste_ml[lab.names.index(name)] == pytest.approx(own, abs=5e-3)
-    assert [s[2:] for s in sent if s[:2] == ["SetOutputTarget", "Volume"]] == [["M3", "15.000000"]]
-    assert [s[2:4] for s in sent if s[0] == "CalibrateOD"] == [["M3", "13000.000000"]]
-
-
-def test_each_device_is_heated_stirred_and_told_its_volume_as_the_run_has_it() -> None:
-    lab = DriverLab(("M0", "M1"), temperature=33.5, stir=0.7)
-    bench = Bench(volume_ml=18.0, volumes_ml={"M1": 23.0})
-    lab.reactors = ChiBioReactors(lab.wire, lab.clock, lab.config, [SOUND] * 2, lab.log, bench)
-    lab.reactors.begin()
-    for name, volume_ml in (("M0", 18.0), ("M1", 23.0)):
+    for name, volume_ml in (("M0", 18.0), ("M3", 15.0)):
         data = lab.device.apps[name].data
         assert [data[item]["target"] for item in ("Thermostat", "Stir", "Volume")] == [33.5, 0.7, volume_ml]
     assert [row["temperature"] for row in lab.of("device")] == [33.5, 33.5]
+    assert [s[2:4] for s in sent if s[0] == "CalibrateOD"] == [["M3", "13000.000000"]]
 
 
 # -- end and resume --------------------------------------------------------------------------------------------------
@@ -451,12 +436,8 @@ def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float,
     assert lab.device.apps["M0"].data["Experiment"]["ON"] == 1
     lab.clock.sleep(300.0)
     assert lab.motors_off()
-
-
-def test_end_stops_the_experiments_too() -> None:
-    lab = begun(("M0", "M1"), minutes=3)
     lab.reactors.end()
-    assert all(lab.device.apps[n].data["Experiment"]["ON"] == 0 for n in lab.names)
+    assert all(lab.device.apps[name].data["Experiment"]["ON"] == 0 for name in lab.names)
 
 
 @pytest.mark.parametrize("begun_dose", [False, True])
