@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from envs.plant.sensor import density
 from hardware.emulator.faults import inject
 from tests.hardware.emulator_lab import BLANK, Lab, quiet, running
 
@@ -25,12 +24,6 @@ def test_formula_with_a_calibrated_and_an_uncalibrated_zero() -> None:
     assert lab.state()["OD"]["current"] == pytest.approx(0.5, abs=1e-3)
 
 
-@pytest.mark.parametrize("od", [-0.3, 0.0, 0.05, 0.5, 1.0, 4.0])
-def test_density_inverts_the_formula(od: float) -> None:
-    r = density(od)
-    assert B * r + A * r * r == pytest.approx(od, abs=1e-12)
-
-
 def test_calibration_to_a_known_od() -> None:
     lab = Lab()
     lab.post("/CalibrateOD/OD0/M0/8000/0.5")
@@ -42,12 +35,15 @@ def test_calibration_to_a_known_od() -> None:
     assert lab.state()["OD0"]["target"] == 100000.0
 
 
-def test_a_zero_of_0_makes_every_measurement_raise_and_kills_the_cycle() -> None:
+@pytest.mark.parametrize("path", ["/CalibrateOD/OD0/M0/0/0", "/SetOutputTarget/Volume/M0/0"])
+def test_a_zero_or_a_volume_of_0_kills_the_cycle(path: str) -> None:
+    """The zero in every measurement, the volume where the device regulates itself."""
     lab = Lab()
-    lab.post("/CalibrateOD/OD0/M0/0/0")
-    assert lab.post("/MeasureOD/M0") == 500
+    lab.post(path)
+    assert lab.post("/MeasureOD/M0") == (500 if "OD0" in path else 204)
     lab.post("/Experiment/1/M0")
-    lab.wait(200.0)
+    lab.post("/SetOutputOn/OD/1/M0")
+    lab.wait(600.0)
     state = lab.state()
     assert (state["Experiment"]["ON"], state["Experiment"]["cycles"]) == (1, 1)
     assert state["OD"]["record"] == []

@@ -99,14 +99,6 @@ def test_chemostat_mode_feeds_its_fixed_rate_which_no_route_can_set() -> None:
     assert lab.peek()["Pump1"]["target"] == 0.0
 
 
-def test_volume_0_ends_the_cycle_thread() -> None:
-    lab = Lab(od=0.8, blanked=True)
-    lab.post("/SetOutputTarget/Volume/M0/0")
-    regulate(lab, 0.5)
-    lab.wait(600.0)
-    assert lab.state()["Experiment"]["cycles"] == 1
-
-
 def test_od_on_without_experiment_does_nothing() -> None:
     lab = Lab(od=0.8)
     lab.post("/SetOutputOn/OD/1/M0")

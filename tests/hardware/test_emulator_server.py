@@ -62,21 +62,14 @@ class Served:
 
 
 @pytest.fixture
-def emulator() -> Iterator[Served]:
-    served = Served("--reactors", "M0,M1", "--speed", "60")
+def emulator(request: pytest.FixtureRequest) -> Iterator[Served]:
+    served = Served("--reactors", "M0,M1", "--speed", getattr(request, "param", "60"))
     yield served
     served.end()
 
 
-def test_an_experiment_over_http() -> None:
-    emulator = Served("--reactors", "M0,M1", "--speed", "600")
-    try:
-        _an_experiment(emulator)
-    finally:
-        emulator.end()
-
-
-def _an_experiment(emulator: Served) -> None:
+@pytest.mark.parametrize("emulator", ["600"], indirect=True)
+def test_an_experiment_over_http(emulator: Served) -> None:
     assert emulator.ask("POST", "/Experiment/1/M0") == (204, b"")
     until(lambda: json.loads(emulator.ask("GET", "/getSysdata/")[1])["Experiment"]["cycles"] >= 4)
     state = json.loads(emulator.ask("GET", "/getSysdata/")[1])

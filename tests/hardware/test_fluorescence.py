@@ -128,16 +128,6 @@ def test_a_slot_that_is_on_is_toggled_only_if_its_settings_are_others(found: str
         assert toggles(bench) == 2 * set_anew
 
 
-def test_settings_that_somebody_changes_are_put_right_in_one_go() -> None:
-    bench = begun()
-    slot(bench)["LED"] = "LEDB"
-    station, before = bench.reactors.stations[0], toggles(bench)
-    station.fluorescence.keep_on(station.connection.read())
-    assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + 2)
-    assert station.fluorescence.trouble == ""
-    assert "was found set to LEDB, CLEAR, nm440, x10 and put right" in bench.of("note")[-1]["note"]
-
-
 @pytest.mark.parametrize(
     ("key", "value"), [("LED", "LEDC"), ("BaseBand", "nm670"), ("Emit1Band", "nm510"), ("Gain", "x4")]
 )
@@ -169,14 +159,19 @@ def test_each_reactor_s_own_slot_is_switched() -> None:
     assert len(newest) == 2
 
 
-def test_a_slot_that_somebody_switches_off_is_put_right_and_its_old_value_not_shown() -> None:
+@pytest.mark.parametrize(
+    ("key", "value", "toggled", "found"), [("ON", 0, 1, "off"), ("LED", "LEDB", 2, "set to LEDB, CLEAR, nm440, x10")]
+)
+def test_what_somebody_changes_is_put_right_in_one_go_and_the_old_value_not_shown(
+    key: str, value: Any, toggled: int, found: str
+) -> None:
     bench = begun()
     sample(bench)
-    bench.fault("fp_off")
+    before, slot(bench)[key] = toggles(bench), value
     assert math.isnan(sample(bench)[0])
-    assert slot(bench)["ON"] == 1
+    assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + toggled)
     assert sample(bench)[0] > 300.0
-    assert any("FP1 was found off and put right" in row["note"] for row in bench.of("note"))
+    assert any(f"FP1 was found {found} and put right" in row["note"] for row in bench.of("note"))
 
 
 def test_a_worker_that_lost_its_memory_gets_it_back() -> None:
