@@ -62,14 +62,14 @@ def test_a_recording_that_is_deleted_in_a_run_is_one_line_at_its_end(tmp_path: P
     run.close()
 
 
-def test_an_exception_in_the_controller_ends_the_run_with_its_pumps_off(
+def test_an_exception_in_a_dose_ends_the_run_with_its_pumps_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def act(*given: object) -> None:
+    def steps() -> None:
         raise RuntimeError("a bug")
 
     run = in_a_dose(tmp_path, "M0")
-    monkeypatch.setattr(run.loop.density.law, "act", act)
+    monkeypatch.setattr(run.loop, "run", steps)
     assert control._run(run.loop, run.record, lambda *_: None) == "failed: RuntimeError: a bug"
     assert not any(run.truth("M0")["motors"].values())
     run.close()

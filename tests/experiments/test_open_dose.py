@@ -18,7 +18,7 @@ from tests.hardware.driver_lab import Law
 from tests.hardware.emulator_lab import quiet
 
 FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"
-TARGET = "/SetOutputTarget/Pump1/M0/"
+TARGET, NONE = "/SetOutputTarget/Pump1/M0/", "a dose of 1.20 mL gave no medium"
 
 
 class Full(Rehearsal):
@@ -168,23 +168,21 @@ def test_a_device_that_was_restarted_repeated_nothing(tmp_path: Path, how: str) 
     assert not any(row["feed_times"] for row in run.journal("dose_end"))
 
 
-def test_killed_in_the_waste_tail_no_medium_followed(tmp_path: Path) -> None:
-    run = Cut(tmp_path, FEED_OFF)
-    run.wait(900.0)
-    run.resumed()
-    assert "repeated" not in run.note()
-    assert abs(run.off_by_ml()) < 1.0
-    assert [row["waste_times"] for row in run.journal("dose_end") if row["waste_times"]] == [900 // 63]
-
-
-@pytest.mark.parametrize("request_", [TARGET, WASTE_ON])
-def test_killed_before_the_feed_pump_was_started_nothing_is_booked(tmp_path: Path, request_: str) -> None:
+@pytest.mark.parametrize(
+    ("request_", "note", "waste_times"), [(FEED_OFF, "", [14]), (TARGET, NONE, []), (WASTE_ON, NONE, [14])]
+)
+def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(
+    tmp_path: Path, request_: str, note: str, waste_times: list[int]
+) -> None:
+    """In the waste tail, or before the feed pump was started."""
     run = Cut(tmp_path, request_)
     run.wait(900.0)
     run.resumed()
-    assert "a dose of 1.20 mL gave no medium" in run.note()
+    assert note in run.note()
+    assert "repeated" not in run.note()
     assert abs(run.off_by_ml()) < 1.0
     assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+    assert [row["waste_times"] for row in run.journal("dose_end") if row["waste_times"]] == waste_times
 
 
 @pytest.mark.parametrize(("request_", "fed"), [(FEED_ON, True), (WASTE_ON, False), (TARGET, False)])

@@ -14,6 +14,7 @@ from experiments.cli.outlet import Screen
 from tests.programs import Program
 
 LINES = 40
+RUN = "controller=pi", "scenario=hold", "scenario.minutes=[30]", "hydra.run.dir=run"
 
 
 def full_pipe() -> tuple[int, int]:
@@ -35,11 +36,6 @@ def stopped_terminal() -> tuple[int, int]:
     return reader, writer
 
 
-def deployed(folder: Path, out: Connection | Path) -> Program:
-    words = "controller=pi", "scenario=hold", "scenario.minutes=[30]", "hydra.run.dir=run"
-    return Program("experiments.deploy", *words, cwd=folder, out=out, WITHOUT_FIGURES="1")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("made", [full_pipe, stopped_terminal])
 def test_a_reader_that_stopped_stops_no_run(made: Callable[[], tuple[int, int]], tmp_path: Path) -> None:
@@ -48,7 +44,8 @@ def test_a_reader_that_stopped_stops_no_run(made: Callable[[], tuple[int, int]],
     found = []
     for name, out in (("file", tmp_path / "out"), ("stopped", Connection(writer))):
         (tmp_path / name).mkdir()
-        assert deployed(tmp_path / name, out).wait() == 0
+        program = Program("experiments.deploy", *RUN, cwd=tmp_path / name, out=out, WITHOUT_FIGURES="1")
+        assert program.wait() == 0
         run = tmp_path / name / "run"
         log = re.sub(r"\d\d:\d\d:\d\d", "", (run / "deploy.log").read_text())
         kinds = [json.loads(line)["kind"] for line in (run / "journal.jsonl").read_text().splitlines()]

@@ -233,16 +233,6 @@ def test_slow_network_and_its_recovery() -> None:
     assert c.state()["Stir"]["target"] == 0.7  # the late one arrives all the same
 
 
-def test_malformed_and_truncated_answers() -> None:
-    c = Client()
-    inject(c.device, "malformed", value=1)
-    with pytest.raises(json.JSONDecodeError):
-        json.loads(c.link.get("/getSysdata/").body)
-    inject(c.device, "truncated", value=1)
-    assert "before the end" in c.fails(lambda: c.link.get("/getSysdata/"))[0]
-    assert json.loads(c.link.get("/getSysdata/").body)["present"] == 1
-
-
 def test_a_foreign_client_changes_the_selection_between_two_requests() -> None:
     c = Client()
     inject(c.device, "foreign_selects", value=0.5)

@@ -10,7 +10,7 @@ import pytest
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.faults import inject
-from tests.hardware.emulator_lab import BLANK, Lab, running
+from tests.hardware.emulator_lab import Lab, running
 
 SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysdata.json"
 
@@ -131,10 +131,6 @@ def test_only_the_selected_reactor_is_served_and_an_absent_one_is_ignored() -> N
     lab.post("/SetOutputTarget/Stir/0/0.6")  # 0 = the one selected
     assert lab.state("M1")["Stir"]["target"] == 0.6
     assert lab.state("M0")["Stir"]["target"] == 0.5
-
-
-def test_blanked_start_has_the_zero_an_operator_would_have_set() -> None:
-    assert Lab(blanked=True).state()["OD0"]["target"] == BLANK
 
 
 @pytest.mark.parametrize(

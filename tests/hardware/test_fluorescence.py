@@ -72,23 +72,22 @@ def test_simulated_reactors_measure_it_where_the_plant_fluoresces() -> None:
     assert one.measure().fluorescence is None
 
 
-def test_the_device_shows_emissions_over_the_base() -> None:
+@pytest.mark.parametrize(
+    ("command", "seen"),
+    [(COMMAND, True), (COMMAND.replace("LEDA", "LEDD"), False), (COMMAND.replace("nm440", "nm510"), False)],
+)
+def test_the_device_shows_emissions_over_the_base_and_a_pigment_in_its_own_light_alone(
+    command: str, seen: bool
+) -> None:
     emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5, temperature=33.0)
-    assert emulated.post("/changeDevice/M0") == emulated.post(COMMAND) == emulated.post("/MeasureFP/M0") == 204
+    assert emulated.post("/changeDevice/M0") == emulated.post(command) == emulated.post("/MeasureFP/M0") == 204
     fp, plant = emulated.state()["FP1"], emulated.device.vials["M0"].plant
     assert plant.fluorescence is not None
-    expected = float(plant.fluorescence.apparent(plant.culture.od, plant.minutes)[0])
+    expected = seen * float(plant.fluorescence.apparent(plant.culture.od, plant.minutes)[0])
     assert fp["Base"] > 0.0
-    assert fp["Base"] * fp["Emit1"] == pytest.approx(expected, abs=1.0)
+    assert fp["Base"] * fp["Emit1"] == pytest.approx(expected, abs=seen)
     assert fp["Emit2"] == 0.0
     assert fp["Emit1"] < 1.0
-
-
-@pytest.mark.parametrize("command", [COMMAND.replace("LEDA", "LEDD"), COMMAND.replace("nm440", "nm510")])
-def test_other_light_shows_no_pigment(command) -> None:
-    emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5)
-    assert emulated.post(command) == emulated.post("/MeasureFP/M0") == 204
-    assert emulated.state()["FP1"]["Emit1"] == 0.0
 
 
 # -- the driver --------------------------------------------------------------------------------------------------------

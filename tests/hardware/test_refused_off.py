@@ -73,24 +73,20 @@ def kept(lab: DriverLab, minutes: float) -> Callable[[], None]:
     until_s = lab.clock.now() + 60.0 * minutes
     real_get, real_post = lab.wire.inner.get, lab.wire.inner.post
 
-    def lost(path: str) -> Reply:
-        lab.clock.sleep(20.0)
-        raise LinkError("no answer")
-
-    def post(path: str) -> Reply:
+    def through(path: str, carry_out: Callable[[str], Reply]) -> Reply:
         if lab.clock.now() < until_s:
-            waiting.append(path)
-            return lost(path)
+            waiting.extend([path] * (carry_out is real_post))
+            lab.clock.sleep(20.0)
+            raise LinkError("no answer")
         while waiting:
             real_post(waiting.pop(0))
-        return real_post(path)
+        return carry_out(path)
 
     def get(path: str) -> Reply:
-        if lab.clock.now() < until_s:
-            return lost(path)
-        while waiting:
-            real_post(waiting.pop(0))
-        return real_get(path)
+        return through(path, real_get)
+
+    def post(path: str) -> Reply:
+        return through(path, real_post)
 
     lab.wire.inner.get, lab.wire.inner.post = get, post  # type: ignore[method-assign]
 

@@ -111,13 +111,6 @@ def test_how_much_lateness_is_a_step_of_a_clock(step_s: float, told: bool) -> No
     assert (f"{abs(step_s):.0f} s" in said) == told
 
 
-def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() -> None:
-    clock, sampling = started()
-    clock.sleep(1.5)
-    take(sampling, clock, sample(0.0, 1))
-    assert sampling.late_s == 1.5
-
-
 def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_time() -> None:
     """By the time before a step a sample would be minutes late, and no dose would be given any more."""
     looks = [

@@ -182,11 +182,7 @@ def test_a_feed_command_that_is_heard_after_it_was_given_up_is_booked_and_the_li
 
 @pytest.mark.parametrize(("seconds", "fails"), [(15.0, False), (20.0, True)], ids=["slow", "silent"])
 def test_one_reactor_that_is_slow_or_silent_does_not_take_its_neighbours_time(seconds: float, fails: bool) -> None:
-    lab = DriverLab(("M0", "M1", "M2"), options=quiet(mu=0.03))
-    lab.client([ReactorCalibration(WEIGHED, WEIGHED)] * 3)
-    lab.law.rate = 0.012
-    lab.reactors.begin()
-    lab.run(4)
+    lab = lab_of(("M0", "M1", "M2"), rate=0.012)
 
     def post(path: str, real: Any) -> Reply:
         if path.endswith("/M0"):

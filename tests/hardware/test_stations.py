@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -311,11 +311,8 @@ def test_a_resumed_run_without_its_journal_is_not_a_new_one(tmp_path: Path) -> N
 )
 def test_every_culture_fits_its_own_vial(bench: Bench, words: str | None) -> None:
     backend = ChiBioConfig(reactors=("M0", "M5"))
-    if words is None:
+    with pytest.raises(UnfitError, match=words) if words else nullcontext():
         chibio.FAMILY.doses(backend, bench)
-    else:
-        with pytest.raises(UnfitError, match=words):
-            chibio.FAMILY.doses(backend, bench)
 
 
 def test_pumps_are_measured_where_both_of_a_reactor_were_weighed(
