@@ -71,12 +71,16 @@ def test_law_cycle_by_cycle(od: float, target: float, mu: float) -> None:
     assert len(seen) > 1 or od == 0.4
 
 
-def test_a_jump_upwards_stops_the_feed_for_that_cycle() -> None:
+@pytest.mark.parametrize("how", ["a jump upwards", "the mode of a chemostat, whose rate no route can set"])
+def test_what_stops_the_feed_for_a_cycle(how: str) -> None:
     lab = Lab(od=0.6, blanked=True)
     regulate(lab, 0.5)
     after_regulation(lab, 5)
     assert lab.peek()["Pump1"]["target"] > 0.0
-    lab.device.vials["M0"].faults.od_jump = 0.1
+    if "jump" in how:
+        lab.device.vials["M0"].faults.od_jump = 0.1
+    else:
+        lab.post("/SetOutputOn/Chemostat/1/M0")
     after_regulation(lab, 6)
     assert lab.peek()["Pump1"]["target"] == 0.0
 
@@ -89,14 +93,6 @@ def test_idle_waste_pump_rests_from_cycle_16_on() -> None:
     after_regulation(lab, 16)
     data = lab.peek()
     assert (data["Pump2"]["target"], data["Pump2"]["ON"], data["Pump1"]["ON"]) == (0.0, 0, 0)
-
-
-def test_chemostat_mode_feeds_its_fixed_rate_which_no_route_can_set() -> None:
-    lab = Lab(od=0.8, blanked=True)
-    regulate(lab, 0.5)
-    lab.post("/SetOutputOn/Chemostat/1/M0")
-    after_regulation(lab, 5)
-    assert lab.peek()["Pump1"]["target"] == 0.0
 
 
 def test_od_on_without_experiment_does_nothing() -> None:
