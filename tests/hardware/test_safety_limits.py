@@ -130,7 +130,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str) -> None:
         np.testing.assert_allclose(allowed, [e[0] for e in expected], rtol=1e-12)
         assert [sorted(kinds, key=order.get) for kinds in told(findings)] == [e[1] for e in expected]
         budget.grant(allowed)
-        feed = allowed * bench.period_s * (rng.random(N) < 0.7)
+        feed = allowed * bench.period_s * (rng.random(N) < 0.7) + 1.2 * (rng.random(N) < 0.02)  # a repetition
         waste = rng.choice([0.0, 0.5, 9.0, -0.4], N)  # the last corrects what was booked
         at = now + float(rng.choice([0.0, 40.0, -70.0, -3000.0, -3600.0, -4000.0], p=[0.5, 0.4, *[0.025] * 4]))
         budget.book(feed, waste, at)  # when it ends, or a repeat that is told of late
