@@ -175,6 +175,7 @@ def test_a_full_disk_stalls_the_cycles_of_all_reactors_while_the_server_answers(
 def test_software_that_begins_anew_has_forgotten_all_and_its_pumps_are_off(fault: str) -> None:
     """After a power cut the clock starts again, too."""
     c = Client(blanked=True)
+    c.lab.wait(1000.0)
     for m in ("M0", "M1"):
         c.link.post(f"/Experiment/1/{m}")
         c.lab.pump("Pump1", 0.5, reactor=m)
@@ -191,7 +192,7 @@ def test_software_that_begins_anew_has_forgotten_all_and_its_pumps_are_off(fault
     assert c.device.truth("M0")["on_s"]["Pump1"] < 8.0
     assert c.state("M0")["Experiment"]["ON"] == 0
     c.link.post("/Experiment/1/M0")
-    begun = "2026-01-01 00:15" if fault == "power_cut" else "2026-01-01 00:05"
+    begun = "2026-01-01 00:15" if fault == "power_cut" else "2026-01-01 00:21"
     assert c.state("M0")["Experiment"]["startTime"].startswith(begun)
 
 
@@ -268,6 +269,14 @@ def test_clock_set_back_during_a_dose_lengthens_the_pause_not_the_dose() -> None
     assert [round(length, 2) for _, length in c.lab.doses()] == [3.25]
     c.lab.wait(30.0)
     assert len(c.lab.doses()) == 2
+
+
+def test_stirrer_that_fails_lets_cells_settle() -> None:
+    c = Client(od=0.5, blanked=True)
+    c.link.post("/Experiment/1/M0")
+    inject(c.device, "stirrer_dead", "M0")
+    c.lab.wait(20 * 60.0)
+    assert c.state()["OD"]["record"][-1] < 0.48
 
 
 @pytest.mark.parametrize(
