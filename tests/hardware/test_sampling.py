@@ -47,6 +47,8 @@ def test_a_sample_is_new_once_and_never_goes_back() -> None:
     assert sampling.look(sample(0.0, 1), 0.0)
     sampling.pass_over(sample(0.0, 1))
     assert not sampling.look(sample(0.0, 1), 0.0)
+    take(sampling, clock, sample(60.0, 3))  # seen so late that the next cycle had begun: it does not hide the next one
+    assert [sampling.look(sample(*each), 0.0) for each in ((120.0, 3), (0.0, 2))] == [True, False]
 
 
 def test_only_a_sample_that_was_waited_for_has_a_known_age() -> None:
@@ -65,14 +67,6 @@ def test_only_a_sample_that_was_waited_for_has_a_known_age() -> None:
     take(sampling, clock, sample(120.0, 3))
     assert sampling.late_s == 10.0
     assert sampling.appeared_s == clock.now() - 10.0
-
-
-def test_a_sample_seen_so_late_that_the_next_cycle_had_begun_does_not_hide_the_next_one() -> None:
-    clock = VirtualClock()
-    sampling = Sampling(CONFIG, clock)
-    take(sampling, clock, sample(60.0, 3))
-    assert sampling.look(sample(120.0, 3), 0.0)
-    assert not sampling.look(sample(0.0, 2), 0.0)
 
 
 def lateness(looks: list[tuple[float, bool, float]], clock: VirtualClock, sampling: Sampling) -> list[float]:
@@ -121,16 +115,6 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
     ]  # fmt: skip
     late = lateness(looks, *started())
     assert late == [0.0, 4.0, math.inf, 0.0, 9.0, math.inf, 0.0, 5.0, math.inf, 0.0, 2.0]
-
-
-def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_after_it() -> None:
-    """Its records begin anew: by the time before, this one would be 20 s old, and a dose fall into a measurement."""
-    clock, sampling = started()
-    take(sampling, clock, sample(0.0, 1))
-    sampling.pass_over(sample(math.nan, 1))
-    clock.sleep(80.0)
-    take(sampling, clock, sample(60.0, 2))
-    assert sampling.late_s == math.inf
 
 
 def test_looks_are_as_far_apart_as_is_set() -> None:
