@@ -194,7 +194,10 @@ def test_a_second_client_on_the_line_is_refused_until_the_first_says_bye() -> No
         assert body.count(b"\n") == 1
     assert device.asked == []
     assert agent.armed
+    beats = agent._beats
+    assert ask(agent, 3, "PING").split(b" ")[1] == b"200"
     assert ask(agent, 3, "POST", "/x", 8).startswith(b"<196616 204 ")  # 3 * 65536 + 8
+    assert agent._beats == beats + 2  # each keeps the pumps running
     assert ask(agent, 3, "BYE").split(b" ")[1] == b"200"
     assert ask(agent, 4, "POST", "/y").split(b" ")[1] == b"204"
     assert ask(agent, 3, "PING").split(b" ")[1] == b"21"
