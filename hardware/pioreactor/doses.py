@@ -190,14 +190,18 @@ class Doses:
             self.extra.append(Given(self._book.elapsed(), 0.0, 0.0, taken))
 
     def _settle_pins(self) -> None:
-        """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too."""
+        """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too.
+
+        What the waste pump took meanwhile is booked with the media: its event may have come, and counted, before.
+        """
+        beside_ml = (self.pumps.pin(WASTE).ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
         for job in (MEDIA, WASTE):
             pin, now = self.pumps.pin(job), self._clock.now()
             if self.pumps.odd(job) or not (pin.on or self.pumps.box.driven(job) or now < pin.off_s + SETTLE_S):
                 ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
                 self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
                 if ran_ml > LATE_ML:
-                    self._theirs(job, ran_ml, "by its pin")
+                    self._theirs(job, ran_ml, "by its pin", beside_ml if job == MEDIA else 0.0)
 
     def _settle_strange(self) -> None:
         """Book what was dosed without a command of this run, beyond what was counted already."""
@@ -215,14 +219,14 @@ class Doses:
                 continue
             self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
 
-    def _theirs(self, job: str, ml: float, who: str) -> None:
+    def _theirs(self, job: str, ml: float, who: str, beside_ml: float = 0.0) -> None:
         self.foreign = f"{job} of {ml:.2f} mL without our command ({who})"
-        self._give(job, ml, ml, self.foreign)
+        self._give(job, ml, ml, self.foreign, beside_ml)
 
-    def _give(self, job: str, low_ml: float, high_ml: float, why: str) -> None:
+    def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
         """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
         fed = job != WASTE
-        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, (not fed) * high_ml)
+        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, beside_ml if fed else high_ml)
         self.extra.append(given)
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
         self._book.log("given", **given.row(why))

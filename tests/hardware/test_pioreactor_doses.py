@@ -159,6 +159,7 @@ def test_what_a_job_of_several_pumps_gives_is_told_booked_by_its_pins_and_left_t
     lab.wait(10.0)
     assert lab.given() == pytest.approx((lab.world.truth["add_media"],) * 2, abs=0.1)
     assert lab.world.truth["add_media"] > 8.0
+    assert lab.ledger(0.0).volume_ml[0] == lab.bench.volume_ml, "waste ran beside it"
     assert not [options for _, options in lab.world.asked if "duration" in options]
     lab.sample()
     lab.dose(0.0)  # it was told, and held one dose
