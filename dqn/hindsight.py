@@ -22,11 +22,9 @@ class Relabel(Protocol):
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
         """Turn uniform random numbers into goals, (..., B, W) -> (..., B, any), for many minibatches at once."""
-        ...
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
         """Give transitions (..., B) the goals that were drawn, (..., B, any), in place."""
-        ...
 
 
 class GoalRelabel:

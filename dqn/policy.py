@@ -2,8 +2,7 @@
 
 Format 2 of policy.npz: arrays `w0, b0, w1, b1, ...` (float32, layer k maps h to relu(h @ wk + bk), the last without
 relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `observation_high` (O,), `actions` (A,), and
-`metadata`, a JSON text with {format, observation: names, model: {...}, config_hash, ...}. No pickled objects. Format 1
-is read, too: it has `pump_rates` for `actions` and no limits of the observation.
+`metadata`, a JSON text with {format, observation: names, model: {...}, config_hash, ...}. No pickled objects.
 
 | observation | what it is | actions |
 |---|---|---|

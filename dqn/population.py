@@ -16,11 +16,6 @@ GROUP = 16
 """Agents per group on a CPU: enough to make the overhead of calling torch small, few enough for the CPU's caches."""
 
 
-def _cores() -> int:
-    """Cores this process may use; where the system cannot say (macOS, Windows), all there are."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def fast_arithmetic() -> None:
     """Numbers below 1e-38 count as 0 in this thread, where the processor can do that.
 
@@ -44,7 +39,8 @@ class Population:
 
     def __init__(self, groups: Sequence[Trainer], threads: int | None = None) -> None:
         self.groups = list(groups)
-        self.threads = threads or _cores()
+        mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()  # macOS, Windows
+        self.threads = threads or mine or 1
 
     @property
     def n_agents(self) -> int:

@@ -24,19 +24,15 @@ class TrainingEnv(Protocol):
 
     def reset(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start episodes in all copies."""
-        ...
 
     def step(self, actions: NDArray[np.intp]) -> Step:
         """One step in all copies; infos["final_obs"] holds last observations where an episode ended."""
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state."""
-        ...
 
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
         """Restore it; returns the current observations."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,6 @@ class GrowthLaw(Protocol):
         Args: substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
         Raises: nothing; parameters are checked where they are set, so the hot path stays bare.
         """
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -206,7 +206,7 @@ def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
     plain = yaml.safe_dump(files.plain(asdict(pair)), sort_keys=False, allow_unicode=True)
     write(folder / "pair.yaml", head + plain)
     from experiments.reporting import charts
-    from experiments.reporting.pair_charts import pair_figure
+    from experiments.reporting.composition_charts import pair_figure
 
     charts.save(pair_figure(pair, points), folder / "figures", "pair")
     rows = [[asdict(p) for p in mine] for mine in points]

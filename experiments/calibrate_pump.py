@@ -5,7 +5,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 
@@ -154,7 +154,7 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
         fit = fit_pump(on_s, doses, grams, date.today().isoformat(), identity)
         weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
         uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
-        values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
+        values = {**asdict(fit.calibration), **uncertainty, "weighings": weighings}
         path = save_calibration(Path(config.backend.calibration), config.reactor, config.pump, values)
     files.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)

@@ -117,10 +117,6 @@ def mark(config: MarkConfig) -> str:
     return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 
-def _body(config: MarkConfig, folder: Path) -> None:
-    print(mark(config))
-
-
 def _quoted(argument: str) -> str:
     """Return a text as it was typed, whatever Hydra's grammar would make of it."""
     key, _, value = argument.partition("=")
@@ -140,7 +136,7 @@ class _Mark(frame.Command[MarkConfig]):
             print(mark(self.config([_quoted(a) for a in given])))
 
 
-main = _Mark("mark", MarkConfig(), _body)
+main = _Mark("mark", MarkConfig(), lambda config, folder: print(mark(config)))
 
 
 if __name__ == "__main__":

@@ -18,11 +18,9 @@ class Clock(Protocol):
 
     def now(self) -> float:
         """Seconds since an arbitrary start; never goes back."""
-        ...
 
     def sleep(self, seconds: float) -> None:
         """Wait; `seconds` <= 0 returns at once."""
-        ...
 
 
 class RealClock:

@@ -21,15 +21,38 @@ from envs.bench import Bench
 from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
-from hardware.check import Check
 from hardware.clock import run_time
-from hardware.errors import ReactorError, RecordingError, UnfitError
+from hardware.errors import DeviceStateError, ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
 
-__all__ = ["Can", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at"]
+__all__ = ["Can", "Check", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at", "report"]
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: what was checked, whether it passed, what was seen, what to do. `required` ones stop a run."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+    def __str__(self) -> str:
+        mark = "pass" if self.ok else ("FAIL" if self.required else "note")
+        return f"{mark}  {self.name}: {self.detail}" + ("" if self.ok else f" -> {self.remedy}")
+
+
+def report(checks: Sequence[Check]) -> None:
+    """Log the lines of a preflight. Raises: DeviceStateError if a required check failed."""
+    for one in checks:
+        log.log(logging.INFO if one.ok else logging.WARNING, "%s", one)
+    failed = [one for one in checks if one.required and not one.ok]
+    if failed:
+        raise DeviceStateError(f"preflight: {len(failed)} of {len(checks)} checks failed, the first: {failed[0]}")
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,13 @@ class Remembers(Protocol):
     or something that remembers. As it stands before its first use, an attribute says which type and shape a saved value
     has, and where it may be None: in place of the nan or the infinity that stands there then.
 
-    A class may have two more members. `added`: keys that a state of an earlier version lacks; they stay as they are.
-    `resumed()`: called after everything was put back; sets what begins anew, or raises ValueError for what cannot be.
+    A class may have a method `resumed()`: called after everything was put back; sets what begins anew, or raises
+    ValueError for what cannot be.
     """
 
     @property
     def remembers(self) -> tuple[str, ...]:
         """The keys of its state."""
-        ...
 
 
 class Words(NamedTuple):
@@ -64,8 +63,6 @@ def restore(owner: Remembers, state: Any, said: Words) -> None:
     for key in owner.remembers:
         name = _name(owner, key)
         now, value = getattr(owner, name), state.get(key, "missing")
-        if key not in state and key in getattr(owner, "added", ()):
-            continue
         if isinstance(now, Remembers):
             restore(now, value if isinstance(value, Mapping) else {}, said)
         elif isinstance(now, list):

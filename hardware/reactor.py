@@ -122,12 +122,10 @@ class Reactor(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """One name per reactor, e.g. ("M0", "M1")."""
-        ...
 
     @property
     def handed_over(self) -> Mask:
         """Reactors that the device's own regulation has been given for good, shape (N,)."""
-        ...
 
     def measure(self) -> Measurement:
         """Wait for a new sample of at least one reactor, or, when none comes in time, return with none fresh.
@@ -135,39 +133,30 @@ class Reactor(Protocol):
         Trouble with single reactors is told in `vitals`, so that the others go on.
         Raises: ReactorError for what no waiting can mend.
         """
-        ...
 
     def actuate(self, command: Command) -> Receipt:
         """Carry out a command. Raises: as `measure`."""
-        ...
 
     def repeated(self) -> list[tuple[float, Receipt]]:
         """Return what was given beyond the receipts, or less where negative: run time, s, and volumes, in order."""
-        ...
 
     def elapsed(self) -> float:
         """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
-        ...
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """All pumps that feed or empty `rows` off, verified; returns what failed, one line per reactor, name first."""
-        ...
 
     def give_up(self, rows: Mask) -> list[str]:
         """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed, as `pumps_off`."""
-        ...
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
-        ...
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
         """Hand `rows` over to the device's own regulation at `setpoint` (OD, (N,)); returns what failed."""
-        ...
 
     def stop(self) -> None:
         """All pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
-        ...
 
 
 @runtime_checkable
@@ -176,7 +165,6 @@ class KeepsLevels(Protocol):
 
     def set_level(self, n: int, level_ml: float) -> None:
         """Put the ledger of reactor n to a volume, as soon as it answers."""
-        ...
 
 
 @contextmanager

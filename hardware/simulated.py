@@ -8,7 +8,6 @@ import numpy as np
 
 from conf.schema import check, require, setting
 from envs.plant.plant import Plant, PlantConfig
-from hardware.clock import Clock, VirtualClock
 from hardware.family import Can, Family, Opening
 from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 
@@ -39,19 +38,14 @@ class SimulatedReactors:
     Args:
       plant: N vials, reset to the state the run starts from.
       config: names and what the pump is believed to deliver. control_min: between samples, min.
-      clock: virtual, or a scaled one to watch a run.
     """
 
-    def __init__(
-        self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0, clock: Clock | None = None
-    ) -> None:
+    def __init__(self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0) -> None:
         if plant.n != len(config.reactors):
             raise ValueError(f"plant has {plant.n} vials: allowed {len(config.reactors)}, one per reactor")
         self.plant = plant
         self.config, self.control_min = config, control_min
-        self._clock = clock or VirtualClock()
-        self._started = self._clock.now()
-        self._sampled = False
+        self._minutes, self._sampled = 0.0, False
         self._feed_s = np.zeros(plant.n)
         self._target = np.full(plant.n, np.nan)
 
@@ -64,7 +58,7 @@ class SimulatedReactors:
         """Let the control period pass (with the dose of the last command) and read every sensor. Raises: nothing."""
         if self._sampled:
             self.plant.advance(self.control_min, self._feed_s, temperature_target=self._target)
-            self._clock.sleep(60.0 * self.control_min)
+            self._minutes += self.control_min
             self._feed_s = np.zeros(self.plant.n)
         self._sampled = True
         return Measurement(
@@ -88,8 +82,8 @@ class SimulatedReactors:
         return []
 
     def elapsed(self) -> float:
-        """Run time on the clock, s."""
-        return self._clock.now() - self._started
+        """Run time, s."""
+        return 60.0 * self._minutes
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """No dose is pending for `rows` any more. Nothing can fail."""

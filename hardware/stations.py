@@ -16,7 +16,7 @@ from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals,
 from hardware.storage.doses import Given
 from hardware.storage.history import History
 
-__all__ = ["Newest", "Stations"]
+__all__ = ["Newest", "Plan", "Stations"]
 
 AGAIN_S = 20.0  # from one `measure` without a sample to the next, while there is none
 
@@ -38,13 +38,13 @@ class Newest:
     fluorescence: float | None = None
 
 
-class Plan(Protocol):
-    """What was begun, mL."""
+@dataclass(frozen=True)
+class Plan:
+    """A dose, mL; carry_ml: asked but put off to the next, because it is less than the pump can deliver."""
 
-    @property
-    def feed_ml(self) -> float: ...
-    @property
-    def waste_ml(self) -> float: ...
+    feed_ml: float = 0.0
+    waste_ml: float = 0.0
+    carry_ml: float = 0.0
 
 
 class Doses(Protocol):

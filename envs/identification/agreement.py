@@ -88,11 +88,6 @@ class Agreement:
     minutes: float
 
     @property
-    def long_enough(self) -> bool:
-        """Whether anything can be said."""
-        return self.minutes >= SHORTEST_WINDOW_MIN
-
-    @property
     def left(self) -> list[Compared]:
         """What no longer holds at the end of the run, the earliest first."""
         found = [c for c in (self.growth, self.gain, self.net) if c.left_min is not None]
@@ -103,7 +98,7 @@ class Agreement:
 
         Args: planned: whether anything was decided with a model that somebody fitted; else there is none to renew.
         """
-        if not self.long_enough:
+        if self.minutes < SHORTEST_WINDOW_MIN:
             return (
                 f"Too short to tell: {self.minutes:.0f} min of trustworthy readings, at least "
                 f"{SHORTEST_WINDOW_MIN:.0f} are needed."
@@ -152,10 +147,12 @@ def agreement(raw: Series, mu: float, tau: float) -> Agreement:
         means.append(_mean(error[a : b - 1], clean.time[a:b]))
         left[a : b - 1] = error[a : b - 1] - np.nanmean(error[a : b - 1]) if means[-1] else error[a : b - 1]
     times = (tuple(float(clean.time[a]) for a, _ in pieces), tuple(float(clean.time[b - 1]) for _, b in pieces))
+    taus = [s.tau for s in along]
+    gains = [None if t is None else Parameter(tau / t.value, tau / t.high, tau / t.low) for t in taus]
     return Agreement(
         series=clean,
         growth=_of_segments("growth", clean, along, [s.mu for s in along], mu),
-        gain=_of_segments("the pump's gain", clean, along, [_gain(s.tau, tau) for s in along], 1.0),
+        gain=_of_segments("the pump's gain", clean, along, gains, 1.0),
         net=Compared("the predicted net growth", *times, tuple(means), 0.0, mu, segments=1),
         predicted=predicted,
         rms=_rms(clean.od[1:] * -np.expm1(-error)),
@@ -189,10 +186,6 @@ def _mean(error: Array, time: Array) -> Parameter | None:
     variance = moments[0] + 2.0 * sum((1.0 - k / (LAGS + 1)) * m for k, m in enumerate(moments) if k > 0)
     half = 1.96 * float(np.sqrt(max(variance, 0.05 * moments[0]) / n))
     return Parameter(mean / rate, (mean - half) / rate, (mean + half) / rate)
-
-
-def _gain(tau: Parameter | None, model: float) -> Parameter | None:
-    return None if tau is None else Parameter(model / tau.value, model / tau.high, model / tau.low)
 
 
 def _of_segments(

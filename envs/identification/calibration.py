@@ -92,7 +92,8 @@ def calibrate(
     returned = whole if free_run is None or config.method == "prediction_error" else free_run
     assert returned.tau is not None
     mu, tau = returned.mu, returned.tau
-    model = _from_best_start(inside, mu.value, tau.value)
+    shape, seen = trajectory(inside.time, inside.pump_rate, mu.value, tau.value, 1.0), np.isfinite(inside.od)
+    model = shape * (inside.od[seen] @ shape[seen]) / (shape[seen] @ shape[seen])  # from the start x_0 that fits best
     result = Calibration(
         screened=screened,
         window=window,
@@ -163,10 +164,3 @@ def _free_run(inside: Series, method: str) -> Fit | None:
         if method == "free_run":
             raise
         return None
-
-
-def _from_best_start(part: Series, mu: float, tau: float) -> Array:
-    """Free run of (mu, tau) from the start x_0 that minimises sum (x - y)^2, shape (n,)."""
-    shape = trajectory(part.time, part.pump_rate, mu, tau, 1.0)
-    seen = np.isfinite(part.od)
-    return np.asarray(shape * (part.od[seen] @ shape[seen]) / (shape[seen] @ shape[seen]))

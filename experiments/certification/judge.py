@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from dqn.policy import RELATIVE, Policy
-from experiments.certification.boxes import contradictions
+from experiments.certification.boxes import contradictions, on_lines
 from experiments.certification.config import CertifyConfig, Limits
 from experiments.certification.intervals import Mask, Points, drops, points_in_strips
-from experiments.certification.line import on_lines
 from experiments.certification.network import Array, Network
 from experiments.certification.polygons import Regions, partition
 from experiments.certification.question import Question, actions, question

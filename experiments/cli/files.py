@@ -1,19 +1,21 @@
-"""JSON and CSV as every command writes them, whole or not at all, and YAML as every command reads it."""
+"""JSON as every command writes it, whole or not at all; YAML as every command reads it; how a run was started."""
 
-import csv
 import io
 import json
-import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hardware.storage import atomic
+from hardware.storage.journal import plain
 from hardware.storage.yaml_text import read_text
 
-__all__ = ["load_yaml", "plain", "write_csv", "write_json"]
+__all__ = ["choices", "given", "load_yaml", "plain", "write_json"]
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:
@@ -30,28 +32,25 @@ def load_yaml(path: Path | str) -> DictConfig | ListConfig:
         raise ValueError(f"not YAML ({str(error).splitlines()[0]})") from None
 
 
-def plain(value: Any) -> Any:
-    """Convert a value to JSON's types: arrays and tuples to lists, keys to text, non-finite numbers to null."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        if all(type(v) is float and math.isfinite(v) for v in value):
-            return value
-        return [plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, indent: int | None = 2) -> None:
     """Write a mapping as JSON, atomically."""
     atomic.write(path, json.dumps(plain(content), indent=indent) + "\n", fsync)
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows under the keys of the first one, atomically."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    atomic.write(path, text.getvalue(), fsync=False)
+BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
+
+
+def given(folder: Path) -> list[str]:
+    """List the words of the command line of a run folder, `key=value` each; [] where it does not say."""
+    with suppress(OSError, ValueError, yaml.YAMLError):
+        words = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
+        return [str(word).lstrip("+") for word in words] if isinstance(words, list) else []
+    return []
+
+
+def choices(folder: Path) -> dict[str, str]:
+    """Map group to preset of a run folder, {} where it does not say; a group without a preset is left out."""
+    path = folder / ".hydra" / "hydra.yaml"
+    block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
+    pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))
+    return {key: value for key, _, value in pairs if value and value != "null" and not key.startswith("hydra/")}

@@ -170,16 +170,14 @@ class Pause:
 
         A worker hears it from the terminal and from its command, which then waits for it.
         """
-        if self._came and self._ours(number) and multiprocessing.parent_process() is None:
+        old = self._before[number]
+        ours = number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
+        if self._came and ours and multiprocessing.parent_process() is None:
             print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
             os._exit(STATUS)
         if not self._came:
             print(f"stopping {self._until}; once more stops at once", flush=True)
         self._came.append(number)
-
-    def _ours(self, number: int) -> bool:
-        old = self._before[number]
-        return number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
 
     def pass_on(self) -> None:
         """Give what came to whoever listened before: a batch system queues the job again, or lets it work on.

@@ -204,13 +204,6 @@ def _free(folder: Path) -> bool:
         return True
 
 
-def _state(job: Job) -> str:
-    """Return the state of a job now: a process that was killed leaves `running` behind."""
-    if job.state == "missing" and (job.folder / "summary.json").is_file():  # of a sweep without records
-        return "finished"
-    return "stopped" if job.state == "running" and _free(job.folder) else job.state
-
-
 def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
     """Every job of a sweep as it stands, in order of its number.
 
@@ -221,18 +214,10 @@ def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
         [Job.at(folder / str(k)) for k in range(len(expected))] if expected is not None else list(map(Job.at, there))
     )
     for k, job in enumerate(found):
-        job.state = _state(job)
-        job.overrides = [a.lstrip("+") for a in (expected[k] if expected is not None else _given(job.folder))]
+        if job.state == "running" and _free(job.folder):  # a process that was killed leaves that behind
+            job.state = "stopped"
+        job.overrides = [a.lstrip("+") for a in (expected[k] if expected is not None else files.given(job.folder))]
     return found
-
-
-def _given(folder: Path) -> list[str]:
-    """Read the overrides of a job that has begun, as Hydra wrote them down."""
-    try:
-        lines = files.load_yaml(folder / ".hydra" / "overrides.yaml")
-        return [str(line) for line in lines]
-    except (OSError, ValueError):
-        return []
 
 
 def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
+from experiments.comparison.config import TABLE_2
 from experiments.comparison.page import law_of
-from experiments.comparison.published import TABLE_2
 from experiments.comparison.trials import DensityTrial, ShareTrial
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
 from experiments.reporting.tables import clock

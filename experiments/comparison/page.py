@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.comparison.published import TABLE_2
+from experiments.comparison.config import TABLE_2
 from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Best, Table, count, number, plus_minus
 

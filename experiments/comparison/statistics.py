@@ -39,7 +39,9 @@ class Spread:
         self.mean = float(finite.mean()) if self.n else float("nan")
         self.median = float(np.median(finite)) if self.n else float("nan")
         self.sd = float(finite.std(ddof=1)) if self.n > 1 else float("nan")
-        self.median_ci95 = _around_median(np.sort(finite))
+        # of the median whatever the distribution: order statistics, by the binomial of a sign test
+        ordered, below = np.sort(finite), int(binom.ppf(0.025, self.n, 0.5)) if self.n else 0
+        self.median_ci95 = [float(ordered[below - 1]), float(ordered[-below])] if below else [float("nan")] * 2
         half = float(student.ppf(0.975, self.n - 1)) * self.sd / self.n**0.5 if self.n > 1 else float("nan")
         self.ci95 = [self.mean - half, self.mean + half]
 
@@ -48,19 +50,6 @@ class Spread:
         """-1 or 1 where the interval excludes zero, else 0. Without any spread the sign of the mean counts."""
         low, high = self.ci95
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
-
-
-def _around_median(ordered: Array) -> list[float]:
-    """95 % interval of the median whatever the distribution: order statistics, by the binomial of a sign test."""
-    n = ordered.size
-    below = int(binom.ppf(0.025, n, 0.5)) if n else 0
-    return [float(ordered[below - 1]), float(ordered[n - below])] if below else [float("nan")] * 2
-
-
-def _median_or_never(settling: Array) -> float:
-    """Median over replicates with "never" as infinity; nan where half or more never settle."""
-    middle = float(np.median(np.where(np.isfinite(settling), settling, np.inf))) if settling.size else float("nan")
-    return middle if np.isfinite(middle) else float("nan")
 
 
 def _names(trial: Trial) -> dict[str, Any]:
@@ -75,6 +64,7 @@ def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
     """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
+    settled = float(np.median(np.nan_to_num(score.settling_min, nan=np.inf)))  # "never" is infinity
     return _names(trial) | {
         "window": window.label,
         "setpoint": window.setpoint,
@@ -87,7 +77,7 @@ def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
         "itae_median": itae.median,
         "ise_ci95": ise.ci95,
         "itae_ci95": itae.ci95,
-        "settling_min": _median_or_never(score.settling_min),
+        "settling_min": settled if np.isfinite(settled) else float("nan"),
         "steady_abs_error": Spread(score.steady_abs_error).mean,
         "media_ml": Spread(trial.media(window)).mean,
     }

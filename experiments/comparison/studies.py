@@ -10,8 +10,7 @@ from envs.identification.calibration import IdentifyConfig, calibrate
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
 from experiments.comparison import figures, statistics
-from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.published import SETTLING_MIN, TABLE_2
+from experiments.comparison.config import SETTLING_MIN, TABLE_2, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, ShareTrial, Trial
 from experiments.reporting.calibration_charts import fit_figure
 

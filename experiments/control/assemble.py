@@ -27,7 +27,7 @@ from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
-from experiments.cli.choices import choices
+from experiments.cli.files import choices
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.laws import registry
@@ -41,9 +41,8 @@ from experiments.loop.share import Light, Share, program_of
 from experiments.loop.signals import Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop
-from hardware.check import report
 from hardware.errors import ReactorError, UnfitError
-from hardware.family import Family, Opening, family_of
+from hardware.family import Family, Opening, family_of, report
 from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock

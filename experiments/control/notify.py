@@ -57,8 +57,12 @@ class Hook:
         self._child: subprocess.Popen[bytes] | None = None
         self._by_http = target.lower().startswith(ADDRESS)
         if self._by_http:
-            self.name = self._public(target)
-            return
+            with suppress(ValueError):
+                parts = urlsplit(target)
+                if parts.hostname:
+                    self.name = f"{parts.scheme}://{parts.hostname}/…"
+                    return
+            raise frame.UserError("notify: the address has no host; allowed https://HOST/...")
         try:
             self._command = shlex.split(target)
         except ValueError as error:
@@ -67,17 +71,6 @@ class Hook:
         if not self._command or shutil.which(self._command[0]) is None:
             raise frame.UserError("notify: there is no such command; allowed a command, https://... or env:NAME")
         self.name = Path(self._command[0]).name
-
-    @staticmethod
-    def _public(address: str) -> str:
-        try:
-            parts = urlsplit(address)
-            host = parts.hostname
-        except ValueError:
-            host = None
-        if not host:
-            raise frame.UserError("notify: the address has no host; allowed https://HOST/...")
-        return f"{parts.scheme}://{host}/…"
 
     def send(self, line: bytes) -> str:
         """Deliver one line; what went wrong in a few words that name no secret, "" if nothing did."""

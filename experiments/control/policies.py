@@ -20,7 +20,7 @@ from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
-from hardware.check import Check
+from hardware.family import Check
 from hardware.storage import atomic
 
 __all__ = [
@@ -72,7 +72,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Training:
-    """What a policy file says of its training; nan where a file of an earlier version does not say it.
+    """What a policy file says of its training; nan where it does not say it.
 
     control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
     setpoints: lowest and highest one, OD. relative: it serves any control period and setpoint.
@@ -107,20 +107,13 @@ class Training:
         }
         return [reason for reason, holds in reasons.items() if holds]
 
-    def unsaid(self) -> list[str]:
-        """List what the file does not say."""
-        said = {"updates": self.updates, "regret": self.regret_pct}
-        said |= {} if self.relative else {"trained setpoints": self.setpoints[0]}
-        return [name for name, value in said.items() if np.isnan(value)]
-
     def __str__(self) -> str:
         low, high = self.setpoints
         where = (
             "any growth rate, pump, control period and setpoint" if self.relative else f"setpoints {low:g} to {high:g}"
         )
-        said = f"regret {self.regret_pct:.2g} % against the optimum of its model, {where}"
-        missing = self.unsaid()
-        return said if not missing else f"{said}; it does not say {', '.join(missing)}: an earlier version wrote it"
+        regret = f"{self.regret_pct:.2g} % against the optimum of its model"
+        return f"regret {'not known' if np.isnan(self.regret_pct) else regret}, {where}"
 
 
 def find_policy(name: str) -> Path:

@@ -14,7 +14,6 @@ from experiments.cli.frame import swept
 from experiments.cli.stop import heard, one_interrupt
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
-from experiments.control.bench_marks import BenchMarks
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
@@ -31,18 +30,53 @@ from experiments.record.summary import (
 from experiments.reporting import charts
 from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError
+from hardware.storage.marks import NAME, Mark, read_marks
 
-__all__ = ["deploy"]
+__all__ = ["BenchMarks", "deploy"]
 
 log = logging.getLogger(__name__)
 
 
-def _began(setup: Setup, folder: Path) -> None:
-    """Log what is run, for how long, and where to watch it."""
-    longest = max(s.total_min for s in setup.scenarios)
-    title = f"{setup.title}, {', '.join(setup.backend.reactors)}"
-    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
-    log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
+class BenchMarks:
+    """The levels and shares that were marked in a run's folder, each taken over once, also over a resume."""
+
+    def __init__(self, record: Record) -> None:
+        self._record, self._size = record, -1
+        self._taken = sum(row["kind"] in ("level", "share") for row in record.journal.rows)
+
+    def take(self, loop: ClosedLoop) -> None:
+        """Tell the loop what was marked since the last call; a damaged file of marks is only reported.
+
+        Raises: RecordingError of the journal.
+        """
+        path = self._record.folder / NAME
+        size = path.stat().st_size if path.is_file() else -1
+        if size == self._size:
+            return
+        self._size = size
+        try:
+            marked = [mark for mark in read_marks(self._record.folder) if mark.measured]
+        except RecordingError as error:
+            log.warning("%s", error)
+            return
+        for mark in marked[self._taken :]:
+            self._taken += 1
+            self._tell(loop, mark)
+
+    def _tell(self, loop: ClosedLoop, mark: Mark) -> None:
+        known, journal = mark.reactor in loop.reactors.names, self._record.journal
+        if mark.level_ml is not None:
+            journal.append("level", {"reactor": mark.reactor, "level_ml": mark.level_ml})
+            if known:
+                before = loop.set_level(mark.reactor, mark.level_ml)
+                log.info("%s: %.1f mL in the vial by its mark, %.1f by the ledger", mark.reactor, mark.level_ml, before)
+        if mark.share is not None and mark.sd is not None:
+            counted = {"share": mark.share, "sd": mark.sd, "minute": mark.time_min}
+            journal.append("share", {"reactor": mark.reactor, **counted})
+            if known:
+                said = f"{mark.reactor}: share {mark.share:g} +- {mark.sd:g} at minute {mark.time_min:.0f} by its mark"
+                answer, doubtful = loop.counted(mark.reactor, **counted)
+                log.log(logging.WARNING if doubtful else logging.INFO, "%s, %s", said, answer)
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
@@ -144,7 +178,9 @@ def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
     with one_interrupt(), closing(Record(folder, *kept)) as record:
         for repair in record.repairs:
             log.warning("%s", repair)
-        _began(setup, folder)
+        longest, title = max(s.total_min for s in setup.scenarios), f"{setup.title}, {', '.join(kept[0])}"
+        log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
+        log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
         with assemble.opened(setup, record) as loop:
             tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")
             outcome = _run(loop, record, tell)

@@ -51,7 +51,8 @@ def expected(s: Scenario, k: int, od: float, growth: float, dilution: float, vol
     setpoint, longest = s.setpoints[k], s.minutes[k]
     reached = _reaches(od, setpoint, growth, dilution)
     minutes = min(longest, _ends(s, k, od, growth, dilution, reached))
-    near = _after(od, setpoint, minutes, growth, dilution)
+    way = (min, growth) if od <= setpoint else (max, growth - dilution)
+    near = way[0](od * math.exp(way[1] * minutes), setpoint)
     ml, most = (_fed_ml(t, reached, od > setpoint, growth, dilution, volume_ml) for t in (minutes, longest))
     return Expected(minutes, ml, near, max(ml, most))
 
@@ -70,13 +71,6 @@ def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reache
         if passed:
             return min(_reaches(od, level, growth, dilution), reached)
     return math.inf
-
-
-def _after(od: float, setpoint: float, minutes: float, growth: float, dilution: float) -> float:
-    """OD after so many minutes on the way to the setpoint."""
-    if od <= setpoint:
-        return min(od * math.exp(growth * minutes), setpoint)
-    return max(od * math.exp((growth - dilution) * minutes), setpoint)
 
 
 def timetable(config: DeployConfig, place: str, now: datetime) -> str:
@@ -113,17 +107,12 @@ def _device(setup: Setup) -> Iterator[str]:
         yield unmeasured
 
 
-def _start_od(setup: Setup, scenario: Scenario) -> float:
-    """Return the OD a reactor starts from, as far as that is known; else the one its first step asks for."""
-    known = setup.family.start_od(setup.backend, setup.plant)
-    return max(known, scenario.recovery_od) or scenario.setpoints[0]
-
-
 def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: datetime) -> Iterator[str]:
     """List the steps of one reactor, each in a line, and whether its medium lasts."""
     growth, volume_ml = setup.model.mu, setup.bench.volume_of(name)
     dilution = setup.model.max_pump_rate / setup.model.tau * (setup.bench.volume_ml / volume_ml)
-    od, at, ml, most = max(_start_od(setup, scenario), 1e-3), 0.0, 0.0, 0.0
+    known = max(setup.family.start_od(setup.backend, setup.plant), scenario.recovery_od)
+    od, at, ml, most = max(known or scenario.setpoints[0], 1e-3), 0.0, 0.0, 0.0
     yield f"{name} ({role}), from OD {od:g}, growth {growth:g} 1/min"
     yield HEAD
     if scenario.recovery_od:

@@ -34,7 +34,6 @@ class Controller(Protocol):
 
     def reset(self, n: int) -> None:
         """Forget everything; from here on there are n reactors, at the start of a run."""
-        ...
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """Pump rates for the coming control period, mL/s, shape (N,).
@@ -47,7 +46,6 @@ class Controller(Protocol):
             is returned elsewhere is ignored.
         Raises: nothing for readings of any value.
         """
-        ...
 
 
 @runtime_checkable
@@ -56,7 +54,6 @@ class Explains(Protocol):
 
     def explain(self) -> dict[str, Array]:
         """Name -> value of the last decision, each with leading axis N."""
-        ...
 
 
 @runtime_checkable
@@ -65,7 +62,6 @@ class Accounts(Protocol):
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in, or was put off to the next dose, since this was last called, mL, shape (N,)."""
-        ...
 
 
 @runtime_checkable
@@ -74,7 +70,6 @@ class Watches(Protocol):
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Watch a sample before each `act`; arguments as there, also in recovery; temperature: degC, nan if unknown."""
-        ...
 
 
 def usable(od: Array, rows: Mask) -> Mask:

@@ -256,16 +256,13 @@ class ClosedLoop:
         return state | {name: memory.save(one) for name, one in kept.items() if one is not None}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit.
-
-        A state without `controller` is of a version that did not save it: then the law of the density begins anew.
-        """
+        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
         memory.restore(self, state, OWN)
         for key, part in self._rows.items():
             memory.restore_rows(part, state.get(key, "missing"), key)
         self.interlock.restore(state.get("interlock", "missing"))
         for signal in self.signals:
-            if signal.memory is not None and (signal is not self.density or signal.name in state):
+            if signal.memory is not None:
                 memory.restore(signal.memory, state.get(signal.name, "missing"), memory.words(signal.name))
 
     @property

@@ -112,20 +112,16 @@ class Signal(Protocol):
 
         A target is cut to the interlock's limits; one that is nan leaves the schedule's.
         """
-        ...
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """Report on the sample. Args: given: the command to the actuator, in the unit of `decide`, (N,)."""
-        ...
 
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
         """Fresh medium that went in since this was last called, and what was put off to the next dose, mL, (N,)."""
-        ...
 
     @property
     def memory(self) -> Remembers | None:
         """What a resumed run continues, the signal itself as a rule; None where there is nothing to remember."""
-        ...
 
 
 Count = tuple[int, float, float, float]
@@ -141,14 +137,12 @@ class Counted(Protocol):
 
     def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
         """Take a share of reactor n at a minute of the run, with its sd; return what came of it."""
-        ...
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
         """Replay what earlier lives of the run recorded: columns of each reactor, and every sample.
 
         Args: light: lowest and highest believed counts of fluorescence.
         """
-        ...
 
 
 class Density:

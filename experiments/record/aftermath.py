@@ -20,7 +20,7 @@ from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
 from experiments.loop.signals import ESTIMATED, within_2sd
-from experiments.reporting.agreement_chart import agreement_figure
+from experiments.reporting.calibration_charts import agreement_figure
 from experiments.reporting.charts import save
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Table, number, span
@@ -68,11 +68,9 @@ def believed(run: Path) -> Believed:
 
 
 def _bench(config: Mapping[str, Any]) -> Bench:
-    """Of the run; the nominal one of a run of an earlier version, which did not say it in one place."""
-    try:
+    """Of the run. Raises: UserError."""
+    with frame.refusing(ValueError):
         return build(Bench(), config.get("bench") or {}, "bench")
-    except ValueError:
-        return Bench()
 
 
 def _config(run: Path) -> Mapping[str, Any]:

@@ -252,10 +252,6 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
         raise _no_state(path, str(error)) from None
-    if loop.density.memory is not None and loop.density.name not in state:
-        log.warning(
-            "%s: an earlier version wrote it, without the controller's memory: the controller begins anew", path
-        )
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided, written = (
         {r["reactor"]: r["n"] for r in journal.rows if r["kind"] in kinds} for kinds in (KEPT[:1], KEPT)

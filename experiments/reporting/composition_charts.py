@@ -1,4 +1,4 @@
-"""Pictures of the composition of two species: a run that controlled it, and episodes of a training."""
+"""Pictures of two species: their curves, a run that controlled their composition, and episodes of a training."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,9 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from envs.coculture.pair import PairConfig
+from envs.identification.curves import Plateau
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["composition_figure", "episodes"]
+__all__ = ["composition_figure", "episodes", "pair_figure"]
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, Array]
@@ -99,4 +101,22 @@ def composition_figure(
     density.set_ylabel("OD")
     pump.set_ylabel("pump rate,\nµL/s")
     light.set(ylabel="fluorescence,\ncounts", xlabel="time, h")
+    return figure
+
+
+def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure:
+    """Both curves with what was recorded and its 95 % intervals, where they cross, and production of pigment."""
+    figure, (growth, pigment) = new_figure(7.5, 6.0, 2, 1, sharex=True, height_ratios=[2.0, 1.0])
+    t = np.linspace(*pair.temperatures, 141)
+    for k, (species, mine) in enumerate(zip((pair.first, pair.second), points, strict=True)):
+        growth.plot(t, pair.rates(t)[:, k], color=COLOURS[k], label=species.name)
+        at, value = [p.temperature for p in mine], [p.growth.value for p in mine]
+        sides = [[p.growth.value - p.growth.low for p in mine], [p.growth.high - p.growth.value for p in mine]]
+        growth.errorbar(at, value, sides, linestyle="", marker="o", markersize=4.0, capsize=3.0, color=COLOURS[k])
+    even = pair.even_c
+    growth.axvline(even, color="black", linewidth=0.8, linestyle=":", label=f"alike at {even:.2f} °C")
+    growth.set(ylabel="growth rate, 1/h", ylim=(0.0, None))
+    growth.legend()
+    pigment.plot(t, pair.production(t), color=COLOURS[1])
+    pigment.set(ylabel="pigment, counts\nper hour and OD", xlabel="temperature, °C", ylim=(0.0, None))
     return figure

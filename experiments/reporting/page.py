@@ -17,7 +17,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from experiments.cli.choices import given
+from experiments.cli.files import given
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Best, Table, number, typeset

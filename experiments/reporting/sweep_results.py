@@ -146,12 +146,7 @@ def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[st
         found.append(Configuration(dict(zip(varied, values, strict=True)), members, arrays))
     first = (done or list(jobs))[0].overrides
     common = {key: first[key] for key in keys if key not in varied and key in first}
-    return sorted(found, key=_rank), common
-
-
-def _rank(one: Configuration) -> float:
-    first = next(iter(one.measured.values()), None)
-    return math.inf if first is None else float(first.max())
+    return sorted(found, key=lambda one: next((float(v.max()) for v in one.measured.values()), math.inf)), common
 
 
 def curve(jobs: Sequence[Result], tag: str) -> tuple[Array, Array]:

@@ -28,11 +28,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.0f}" if "e+" in text else text.replace("e-0", "e-")
 
 
-def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
+def plus_minus(mean: float | None, sd: float | None) -> str:
     """Format mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
-        return number(mean, digits)
-    return f"{number(mean, digits)} ± {number(sd, 2)}"
+        return number(mean)
+    return f"{number(mean)} ± {number(sd, 2)}"
 
 
 def clock(last: float) -> tuple[float, str]:

@@ -28,7 +28,7 @@ from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from conf.presets import groups
-from experiments.cli.choices import given
+from experiments.cli.files import given
 from experiments.cli.stop import undisturbed
 from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 

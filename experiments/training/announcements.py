@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.cli.choices import choices
+from experiments.cli.files import choices
 from experiments.reporting import tables
 from experiments.reporting.curves import TRAINING, of_population
 from experiments.reporting.tensorboard import PopulationWriter

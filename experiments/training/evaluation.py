@@ -57,15 +57,12 @@ class Evaluated(Protocol):
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
         """Observation after one step, (..., O), and the error whose square is its cost, (...)."""
-        ...
 
     def asked(self, start: Array) -> Array:
         """Return what groups the steady errors of episodes with starts (G, O), e.g. the setpoint, (G,)."""
-        ...
 
     def best(self, start: Array) -> Rollout:
         """Solve each episode from starts (G, O); the optimum is the only policy (S = 1) of the rollout."""
-        ...
 
 
 def pairs(first: Array, second: Array) -> Array:

@@ -104,7 +104,10 @@ class Session:
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
         if resume:
-            self._restore(checkpoint.load(folder / "checkpoint.pt"))
+            state = checkpoint.load(folder / "checkpoint.pt")
+            self.agents.load_state_dict(state["agents"])
+            self.best.load_state_dict(state["best"])
+            self.returns, self.seconds = [list(row) for row in state["returns"]], state["seconds"]
         self.writer = PopulationWriter(folder, self.seeds, self.agents.steps)
         announcements.show(self.writer, config, self.task, self.seeds, folder)
 
@@ -174,12 +177,6 @@ class Session:
             "seconds": self.seconds,
         }
         checkpoint.save(self.folder / "checkpoint.pt", state)
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.agents.load_state_dict(state["agents"])
-        self.best.load_state_dict(state["best"])
-        self.returns = [list(row) for row in state["returns"]]
-        self.seconds = state["seconds"]
 
     def run(self) -> None:
         """Train to the end, or until the limits are met: log every episode, evaluate, checkpoint, show progress.

@@ -52,31 +52,24 @@ class Task(Evaluated, Protocol):
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> TrainingEnv:
         """One copy of the environment per seed."""
-        ...
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
         """How replayed transitions are given another goal."""
-        ...
 
     def selection_grid(self) -> Array:
         """Return the starts, (G, O), on which policies are compared during training."""
-        ...
 
     def report_grid(self) -> Array:
         """Return the reported grid; it shares no point with `selection_grid`."""
-        ...
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
         """Choose the action whose next error is smallest (one-line law), (..., O) -> (...)."""
-        ...
 
     def model(self) -> dict[str, Any]:
         """Describe the model that a policy was trained on, for its file."""
-        ...
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
         """Policy map and example trajectories beside the optimum's."""
-        ...
 
 
 TASKS: dict[type[Any], Callable[[Any], Task]] = {

@@ -66,13 +66,9 @@ class Connection:
         """Clock time of the newest answer over this link, to whichever reactor's request."""
         return self._transport.heard_s
 
-    def switched_off(self) -> Mapping[str, float] | None:
-        """Pump, how many s ago a dead-man switch on the way found it on and switched it off; None: it does not say.
-
-        Raises: as `read`.
-        """
-        found = self._transport.switched_off()
-        return None if found is None else found.get(self.name, {})
+    def switched_off(self) -> Mapping[str, float]:
+        """Pump, how many s ago a dead-man switch on the way found it on and switched it off. Raises: as `read`."""
+        return self._transport.switched_off().get(self.name, {})
 
     def read(self, tries: int = 3) -> DeviceState:
         """Read the reactor's state, certainly its own.

@@ -1,27 +1,48 @@
 """One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hardware.chibio.agenda import Task
-from hardware.chibio.context import Context
+from hardware.chibio.agenda import Agenda, Task
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
-from hardware.chibio.dosing import DosePlan, PumpCalibration, plan_dose
+from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
 from hardware.chibio.ending import conclude, found
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.logbook import Logbook
 from hardware.storage.doses import Given
 
-__all__ = ["DoseSequence"]
+__all__ = ["Context", "DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
 LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then
 REFUSALS = 4  # of pumps that should be off, in a row, until the experiment is ended
 SLOW_S = 1.0  # an answer to a pump command that takes longer is told
+
+
+@dataclass(frozen=True)
+class Context:
+    """One reactor's surroundings.
+
+    connection: its verified conversation. volume_ml: of its culture. calibration: of its pumps and its zero. config,
+    agenda: shared by all reactors; what must happen later is put on the agenda. book: what it reports. past: gives what
+    this run knows of the reactor by the rows that it wrote, those of earlier lives too.
+    """
+
+    connection: Connection
+    volume_ml: float
+    calibration: ReactorCalibration
+    config: ChiBioConfig
+    agenda: Agenda
+    book: Logbook
+    past: Callable[[], ReactorHistory]
 
 
 class DoseSequence:
@@ -32,7 +53,8 @@ class DoseSequence:
 
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
-      what doses gave beyond what was booked when they began, until somebody books and clears it.
+      what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
+      sample a dose was decided for, None where the device's records begin anew.
     """
 
     def __init__(self, context: Context) -> None:
@@ -43,7 +65,7 @@ class DoseSequence:
         self.stuck = ""
         self.escalated = False
         self.extra: list[Given] = []
-        self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
+        self.acted: tuple[float, int] | None = None
         self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
         self._given_up: list[ReactorHistory] = []  # their feed command brought no answer and may yet be carried out
@@ -54,7 +76,7 @@ class DoseSequence:
     def restore(self) -> None:
         """Continue as an earlier life of the run left it; its pumps are to be verified off next."""
         history = self._past()
-        self._acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
+        self.acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
         if history.open:
             self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open by an earlier life of the program")
 
@@ -73,10 +95,6 @@ class DoseSequence:
         """The pump whose command was given up and may still be carried out, "" if there is none."""
         self._given_up = [lost for lost in self._given_up if self._book.elapsed() < lost.on_s + LATE_S]
         return self._given_up[-1].feed_pump if self._given_up else ""
-
-    def forget_sample(self) -> None:
-        """Forget the last sample: the device's records begin anew, and no dose was decided for any of them."""
-        self._acted = None
 
     def begin(
         self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
@@ -97,7 +115,7 @@ class DoseSequence:
         if reason := refusal or self._obstacle(sample, appeared_s, plan.waste_s):
             self._book.tell(f"no dose: {reason}")
             return DosePlan()
-        self._acted = sample
+        self.acted = sample
         if pump == FEED:
             self._carry_ml = plan.carry_ml
         self._doses += plan.feed_duty > 0.0
@@ -123,7 +141,7 @@ class DoseSequence:
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
         """Why no dose may be given for this sample now; "" if nothing stands against it."""
-        if sample is None or sample == self._acted:
+        if sample is None or sample == self.acted:
             return "no new sample"
         if self.running:
             return "the previous dose has not ended"
@@ -140,7 +158,7 @@ class DoseSequence:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
         self._book.write(
             "intent",
-            sample=self._acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
+            sample=self.acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
             waste_ml=plan.waste_ml, carry_ml=self._carry_ml, doses=self._doses, on_s=self._book.elapsed(),
             **({} if plan.pump == FEED else {"feed_pump": plan.pump}),
         )  # fmt: skip
@@ -270,8 +288,8 @@ class DoseSequence:
         if not known.open:
             return
         try:
-            if (ago_s := self._connection.switched_off()) is not None:
-                stopped = {pump: now - s for pump, s in ago_s.items() if now - s > known.on_s}
+            ago_s = self._connection.switched_off()
+            stopped = {pump: now - s for pump, s in ago_s.items() if now - s > known.on_s}
         except ReactorError as error:
             self._book.tell(f"the board agent does not say what it switched off: {error}")
         if stopped:

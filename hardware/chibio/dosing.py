@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
+from hardware.stations import Plan
 
 __all__ = [
     "DosePlan",
@@ -71,13 +72,9 @@ class PumpCalibration:
         """Smallest dose worth giving, mL."""
         return self.volume(self.min_on_s)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for a file."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PumpCalibration:
-        """Invert `as_dict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
+        """Invert `asdict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
 
         A file may hold more than this, for instance the weighings it rests on.
         """
@@ -163,18 +160,14 @@ class SupplyConfig:
 
 
 @dataclass(frozen=True)
-class DosePlan:
-    """One dose: feed and waste duty (targets of the device), their volumes in mL, and what is carried to the next.
+class DosePlan(Plan):
+    """One dose as the device takes it: feed and waste duty, its targets.
 
-    carry_ml: asked but not dosed, because it is less than the pump can deliver; shortfall_ml: cut off by the limit of
-    the feed duty and not carried. pump: that feeds.
+    shortfall_ml: cut off by the limit of the feed duty and not carried. pump: that feeds.
     """
 
     feed_duty: float = 0.0
     waste_duty: float = 0.0
-    feed_ml: float = 0.0
-    waste_ml: float = 0.0
-    carry_ml: float = 0.0
     shortfall_ml: float = 0.0
     pump: str = FEED
 

@@ -66,7 +66,7 @@ def found(
     None takes back what was answered and is not so. Nothing is added where the answers have told it. A pump that is
     found off was switched off by whom and when, in this order: by a restart; by the agent, as it says; by a command of
     ours whose answer was lost, done at once or when a tunnel delivered it; by the end of its experiment; else it never
-    went on, or an agent without a record switched it off after our silence.
+    went on, or an agent that cannot be asked switched it off after our silence.
 
     Args:
       state: as read at run time now_s. seen_s: run time of the last answer before that.

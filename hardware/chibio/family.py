@@ -7,7 +7,6 @@ from pathlib import Path
 
 from envs.bench import VIAL_ML, Bench
 from envs.scenario import Scenario
-from hardware.check import Check, report
 from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import identity
@@ -17,7 +16,7 @@ from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import UnfitError
-from hardware.family import Can, Family, Opening, not_looked_at
+from hardware.family import Can, Check, Family, Opening, not_looked_at, report
 from hardware.link.open import DeviceLock, open_transport
 from hardware.link.transport import Transport
 from hardware.reactor import Array, Reactor, left_off

@@ -36,10 +36,6 @@ class OnboardRegulation:
         """Whether the reactor was handed over."""
         return math.isfinite(self.setpoint)
 
-    def as_handed_over(self, state: DeviceState) -> bool:
-        """Whether the device regulates as the reactor was handed over; False if it never was."""
-        return regulates(state, self.setpoint)
-
     def hand_over(self, setpoint: float) -> None:
         """Pumps off, then target and ON, read back.
 
@@ -60,7 +56,7 @@ class OnboardRegulation:
         """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
         state = self._connection.read()
         what = "left to it"
-        if not self.as_handed_over(state):
+        if not regulates(state, self.setpoint):
             self.hand_over(self.setpoint)
             what = f"handed over again, because its {describe(state)}"
         self._book.tell(f"handed over to the on-board regulation at OD {self.setpoint:g} earlier in this run: {what}")

@@ -90,8 +90,7 @@ class OverflowPump:
             self.trouble = f"the overflow pump, {config.pump}, is {still} after it was set to {config.duty:g} and on"
             return state
         known, self.trouble, self.was_on = self.was_on, "", True
-        # "guard" is the journal's word, kept so that journals of earlier versions can be resumed
-        self._book.log("guard", pump=config.pump, duty=config.duty, found=found)
+        self._book.log("overflow_pump", pump=config.pump, duty=config.duty, found=found)
         if known:
             self._book.tell(f"the overflow pump was found {found} and put right: {config.pump} at {config.duty:g}")
         return state

@@ -7,7 +7,6 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 from envs.bench import VIAL_ML, Bench
-from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
@@ -15,6 +14,7 @@ from hardware.chibio.fluorescence import HIDDEN, FluorescenceSlotConfig
 from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState, Permitted
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import ReactorError
+from hardware.family import Check
 from hardware.link.transport import Transport
 from hardware.logbook import no_log
 

@@ -208,13 +208,8 @@ def _spoilt(pump: Any) -> bool:
     return any(x != x for x in (pump["target"], *(record if isinstance(record, list) else ())))
 
 
-def _modes(data: Any) -> tuple[str, ...]:
-    names = ("Zigzag", "Custom", "Chemostat", "Light", *SLOTS)
-    return tuple(n for n in names if n in data and _flag(data, n, "ON"))
-
-
 def _slot(data: Any, name: str) -> Slot:
-    """Parse a slot; settings are empty and values nan where it is off, or left out by an older agent on the board."""
+    """Parse a slot; settings are empty and values nan where it is off."""
     on, entry = _flag(data, name, "ON"), _get(data, name)
     if not (on and "LED" in entry):
         return Slot(name, on)
@@ -262,7 +257,7 @@ def parse_state(body: bytes) -> DeviceState:
         temperature_target=_number(data, "Thermostat", "target"),
         regulating=_flag(data, "OD", "ON"),
         regulation_target=_number(data, "OD", "target"),
-        modes=_modes(data),
+        modes=tuple(n for n in (*PUMPING_MODES, "Light", *SLOTS) if n in data and _flag(data, n, "ON")),
         volume_ml=_number(data, "Volume", "target"),
         terminal=_terminal(data),
         slots=tuple(_slot(data, n) for n in SLOTS if n in data),

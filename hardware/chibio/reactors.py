@@ -16,8 +16,7 @@ from envs.bench import Bench
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.context import Context
-from hardware.chibio.dose_sequence import REFUSALS
+from hardware.chibio.dose_sequence import REFUSALS, Context
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay

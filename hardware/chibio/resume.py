@@ -47,7 +47,7 @@ class ReactorHistory(History):
     feed_tried: float = math.nan
     waste_tried: float = math.nan
 
-    KINDS: ClassVar = (*History.KINDS, "command", "found", "guard")
+    KINDS: ClassVar = (*History.KINDS, "command", "found", "overflow_pump")
     KEYS: ClassVar = {**History.KEYS, "device_id": str, "blank": float, "start_time": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
@@ -71,7 +71,7 @@ class ReactorHistory(History):
                 f"{key[:-4]}_tried": seen_s if at is NEVER else math.nan for key, at in said.items() if "off" in key
             }
             return replace(known, wasted=known.wasted or "waste_on" in said, **said, **over)  # type: ignore[arg-type]
-        return replace(known, overflow_pump_on=True) if kind == "guard" else known
+        return replace(known, overflow_pump_on=True) if kind == "overflow_pump" else known
 
     def _switched(self, path: str, answer: int | str, at_s: float, took_s: float) -> Self:
         """Note a pump switched in an open dose; the first answer of its kind counts, a refusal does not."""

@@ -49,14 +49,6 @@ class Sampling:
         """Expect the first cycle: the device's own time begins now."""
         self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
 
-    def wait_from_now(self) -> None:
-        """Count the age of the newest sample from now on, and look at once."""
-        self.arrived_s = self.next_poll = self._clock.now()
-
-    def retry_later(self) -> None:
-        """Plan the look after one that fails."""
-        self.next_poll = self._clock.now() + self._config.retry_s
-
     def look(self, state: DeviceState, now: float) -> bool:
         """Whether `state` brings a new sample; plans the look after one that brings none.
 

@@ -8,12 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 from hardware.chibio.agenda import Task
-from hardware.chibio.context import Context
 from hardware.chibio.diagnosis import diagnose, fault_of
-from hardware.chibio.dose_sequence import DoseSequence
+from hardware.chibio.dose_sequence import Context, DoseSequence
 from hardware.chibio.dosing import DosePlan
 from hardware.chibio.fluorescence import Fluorescence
-from hardware.chibio.onboard_regulation import OnboardRegulation
+from hardware.chibio.onboard_regulation import OnboardRegulation, regulates
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, DeviceState
 from hardware.chibio.sampling import Sampling
@@ -93,7 +92,7 @@ class Station:
         self._blank = next((b for b in (history.blank, self._calibration.blank) if math.isfinite(b)), state.blank)
         self.overflow_pump.was_on, self.regulation.setpoint = history.overflow_pump_on, history.handed_over
         self.doses.restore()
-        if not self.regulation.as_handed_over(state):
+        if not regulates(state, self.regulation.setpoint):
             if state.regulating:
                 self.regulation.switch_off()
             self.doses.settle(tries=3)
@@ -132,7 +131,7 @@ class Station:
             if self.regulation.active:
                 self.regulation.hand_over_again()
             self._start_time = self._keep_on(self.connection.read()).start_time
-            self.sampling.wait_from_now()
+            self.sampling.arrived_s = self.sampling.next_poll = self._clock.now()
             self.book.log(
                 "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
                 start_time=self._start_time,
@@ -218,7 +217,7 @@ class Station:
                 yield OLD_CYCLE_S
             elif kind == "restarted":
                 self.sampling.key = None  # the device's records begin anew: any sample is a new one
-                self.doses.forget_sample()
+                self.doses.acted = None
             yield from self.bring_up(waited=kind != "stopped")
             self.book.tell(f"restarted after: {kind}")
         except ReactorError as error:
@@ -232,23 +231,19 @@ class Station:
 
     def poll(self) -> bool:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
-        self.sampling.retry_later()
+        self.sampling.next_poll = self._clock.now() + self._config.retry_s
         try:
             if not self.restored:
-                return self._take_over_later()
+                if not self.busy:
+                    self.restore()
+                    self.busy = True
+                    self._agenda.add(self.take_over())
+                return False
             state = self._keep_on(self.connection.read())
         except (LinkError, ProtocolError, DeviceStateError) as error:
             self.book.report(fault_of(error, present=self.connection.state is not None))
             return False
         return False if self.busy else self._judge(state)
-
-    def _take_over_later(self) -> bool:
-        """Take over the memory of an earlier life that could not be taken at the start. Raises: ReactorError."""
-        if not self.busy:
-            self.restore()
-            self.busy = True
-            self._agenda.add(self.take_over())
-        return False
 
     def _keep_on(self, state: DeviceState) -> DeviceState:
         """Overflow pump and fluorescence slot as this run has them; the reactor's state then."""

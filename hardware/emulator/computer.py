@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from email.utils import format_datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -134,10 +133,6 @@ class Computer:
     def stamp(self) -> str:
         """Format the board's clock as in the web page."""
         return datetime.fromtimestamp(self.wall(), UTC).strftime("%Y-%m-%d %H:%M:%S")
-
-    def http_date(self) -> str:
-        """Format the board's clock as Flask writes a datetime."""
-        return format_datetime(datetime.fromtimestamp(int(self.wall()), UTC), usegmt=True)
 
     def uniform(self, low: float, high: float) -> float:
         """Draw a random number from the computer's own stream."""

@@ -1,6 +1,8 @@
 """The experiment thread of one reactor: measure, regulate, stir, record, once a minute."""
 
 import math
+from datetime import UTC, datetime
+from email.utils import format_datetime
 
 from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.optics import Optics
@@ -38,7 +40,8 @@ class Experiment:
             if experiment["cycles"] == 0:
                 self._started = self._position.computer.wall()
                 experiment["startTime"] = self._position.computer.stamp()
-                experiment["startTimeRaw"] = self._position.computer.http_date()
+                board = datetime.fromtimestamp(int(self._started), UTC)
+                experiment["startTimeRaw"] = format_datetime(board, usegmt=True)  # as Flask writes it
             data["Pump1"]["direction"] = data["Pump2"]["direction"] = 1.0
             yield from self._outputs.everything_off()
             yield from self._outputs.set_on("Thermostat", 1)

@@ -15,7 +15,6 @@ import httpx
 from conf.schema import require
 from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
-from hardware.link.secret import read_secret
 from hardware.link.transport import (
     MAX_BODY,
     WEB_ADDRESS,
@@ -24,6 +23,7 @@ from hardware.link.transport import (
     Transport,
     TransportConfig,
     new_session,
+    read_secret,
     switched_off,
     web_address,
 )  # fmt: skip
@@ -158,7 +158,7 @@ class HttpTransport(Transport):
             with contextlib.suppress(ReactorError):
                 self.post("/_agent/bye")
 
-    def switched_off(self) -> SwitchedOff | None:
+    def switched_off(self) -> SwitchedOff:
         """Ask the agent, if there is one, what it has switched off. Raises: LinkError, ProtocolError."""
         return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 

@@ -95,7 +95,7 @@ class SerialTransport(Transport):
             with contextlib.suppress(LinkError, ProtocolError):
                 self._exchange("BYE", "/")
 
-    def switched_off(self) -> SwitchedOff | None:
+    def switched_off(self) -> SwitchedOff:
         """Ask the agent what it has switched off. Raises: LinkError, ProtocolError."""
         if self._line is None:
             self._open()

@@ -6,8 +6,10 @@ A transport raises `LinkError` when no answer came and `ProtocolError` when it w
 import json
 import math
 import random
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -16,8 +18,17 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ProtocolError
 
 __all__ = [
-    "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
-    "switched_off", "web_address",
+    "MAX_BODY",
+    "WEB_ADDRESS",
+    "Reply",
+    "SharedLink",
+    "SwitchedOff",
+    "Transport",
+    "TransportConfig",
+    "new_session",
+    "read_secret",
+    "switched_off",
+    "web_address",
 ]  # fmt: skip
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
@@ -67,7 +78,6 @@ class Transport(Protocol):
 
     def _request(self, method: str, path: str) -> Reply:
         """One request over this link, GET or POST. Raises: as `get` and `post`."""
-        ...
 
     def disarm(self) -> None:
         """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.
@@ -76,11 +86,8 @@ class Transport(Protocol):
         """
         return
 
-    def switched_off(self) -> SwitchedOff | None:
-        """Ask a dead-man switch on the way, if there is one, what it has switched off; None: it does not say.
-
-        Raises: as `get`.
-        """
+    def switched_off(self) -> SwitchedOff:
+        """Ask a dead-man switch on the way, if there is one, what it has switched off. Raises: as `get`."""
         return {}
 
     def close(self) -> None:
@@ -125,7 +132,7 @@ class SharedLink(Transport):
         self._silent.pop(about, None)
         return reply
 
-    def switched_off(self) -> SwitchedOff | None:
+    def switched_off(self) -> SwitchedOff:
         return self._link.switched_off()
 
     def disarm(self) -> None:
@@ -135,17 +142,15 @@ class SharedLink(Transport):
         self._link.close()
 
 
-def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff | None:
-    """Read from the status of a board agent what it has switched off; None from an agent older than that.
+def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff:
+    """Read from the status of a board agent what it has switched off.
 
     Args: clock: of the device. Raises: ProtocolError for a status that is not an agent's.
     """
     try:
-        found = json.loads(status).get("switched_off")
-        return found and {
-            m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()
-        }
-    except (ValueError, RecursionError, TypeError, AttributeError) as error:
+        found = json.loads(status)["switched_off"]
+        return {m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()}
+    except (ValueError, RecursionError, TypeError, AttributeError, KeyError) as error:
         raise ProtocolError(f"the board agent's status is not readable: {status[:80]!r}") from error
 
 
@@ -180,3 +185,20 @@ class TransportConfig:
     def timeout(self, seconds: float, clock: DeviceClock) -> float:
         """Real seconds to wait for what takes `seconds` by the device's clock."""
         return max(clock.to_real(seconds), self.floor_s)
+
+
+def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r"[!-~]") -> str:
+    """One line of `least` to 256 characters, for the config value `key`.
+
+    Raises: LinkError naming the file and the remedy; never the secret.
+    """
+    file = Path(path).expanduser()
+    try:
+        mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()
+    except OSError as error:
+        raise LinkError(f"{key} = {path}: {error.strerror}; {remedy}") from None
+    if mode & 0o077:
+        raise LinkError(f"{key} = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
+    if not re.fullmatch(f"{printable}{{{least},256}}", secret):
+        raise LinkError(f"{key} = {path}: not one line of {least} to 256 characters; {remedy}")
+    return secret

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 from conf.schema import check, part, require, setting
 from hardware.clock import DeviceClock
-from hardware.link.secret import read_secret
-from hardware.link.transport import WEB_ADDRESS, web_address
+from hardware.link.transport import WEB_ADDRESS, read_secret, web_address
 
 __all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
 
@@ -96,11 +95,6 @@ class PioreactorConfig:
     def address(self, unit: str) -> str:
         """Of a unit's web server."""
         return (self.units.get(unit, UnitConfig()).address or f"http://{unit}.local").rstrip("/")
-
-    @property
-    def leader_address(self) -> str:
-        """Of the leader's web server."""
-        return (self.leader or f"http://{self.broker}").rstrip("/")
 
     def password(self) -> str:
         """Of the broker; it stands in no config, file of a run or line of the screen. Raises: LinkError."""

@@ -5,30 +5,49 @@ more. What it gave is on record with the least and the most, and what was booked
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
 from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, WASTE, Moved, Pumps, Request, Steps
-from hardware.pioreactor.resume import History
+from hardware.stations import Plan
+from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given
 
-__all__ = ["Doses", "Plan"]
+__all__ = ["Doses", "History", "replay"]
 
 DRAINS = 5  # attempts to empty a vial
 UNSEEN = "its end was not on record: at most what was asked, unless its pump was found on"
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What was begun, mL; carry_ml is put off to the next dose."""
+class History(history_of.History):
+    """One unit's past; boot, when it had been started; of an open dose id, and task, the answer to its request."""
 
-    feed_ml: float = 0.0
-    waste_ml: float = 0.0
-    carry_ml: float = 0.0
+    boot: str = ""
+    id: str = ""
+    task: str = ""
+
+    KINDS: ClassVar = (*history_of.History.KINDS, "task")
+    KEYS: ClassVar = {**history_of.History.KEYS, "boot": str}
+
+    def after(self, row: Mapping[str, Any]) -> Self:
+        """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
+        known = super().after(row)
+        if row["kind"] == "intent":
+            return replace(known, id=str(row["id"]), task="")
+        if row["kind"] == "task" and row["id"] == known.id:
+            return replace(known, task=str(row["task"]), wasted=row["job"] != PUMPS[0])
+        return known
+
+
+def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, History]:
+    """Replay the journal of a run for each unit. Args: rows: oldest first. Raises: RecordingError."""
+    return history_of.replayed(rows, History())
 
 
 class Doses:

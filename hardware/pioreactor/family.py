@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from envs.bench import Bench
-from hardware.check import Check, report
 from hardware.clock import RealClock
 from hardware.errors import UnfitError
-from hardware.family import Can, Family, Opening, not_looked_at
+from hardware.family import Can, Check, Family, Opening, not_looked_at, report
 from hardware.link.open import DeviceLock
 from hardware.logbook import Log, no_log
 from hardware.pioreactor.config import FULL_ML, PioreactorConfig, vial_ml
+from hardware.pioreactor.doses import replay
 from hardware.pioreactor.preflight import preflight
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.resume import replay
 from hardware.reactor import Array, Reactor, left_off
 
 __all__ = ["FAMILY", "PioreactorFamily"]

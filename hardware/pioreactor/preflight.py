@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
 
-from hardware.check import Check
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
+from hardware.family import Check
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS
 from hardware.pioreactor.pumps import STEP_S, Barrier

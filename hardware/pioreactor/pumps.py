@@ -302,7 +302,11 @@ class Pumps:
             if math.isnan(off_s) and math.isnan(off_s := ending.off_s()):
                 ending.act()
                 late, flowed = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
-                self.trouble = self._plug(job) if late else self.trouble
+                if late:
+                    pin, word = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
+                    how = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
+                    remedy = f"pull the pump's plug, or on the unit: {word} {pin} --as-int (it is then ended from here)"
+                    self.trouble = f"pin {pin} may run on after {job}, {how}; {remedy}"
                 self.waits = late or self.waits
                 wanted = self.config.waste_factor * flowed - drained
                 if late and drain is None and job == MEDIA and not self.halted and wanted > DRAIN_ML:
@@ -312,12 +316,6 @@ class Pumps:
         self.trouble, self.waits = "", False
         self.proven[job] = self.clock.now()
         return replace(ending.moved(off_s), drained=drained)
-
-    def _plug(self, job: str) -> str:
-        pin = self.box.jobs[job]
-        how = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
-        word = f"{self.facts.purge} pwm_locks {pin} --as-int (it is then ended from here)"
-        return f"pin {pin} may run on after {job}, {how}; pull the pump's plug, or on the unit: {word}"
 
 
 class Seen(NamedTuple):

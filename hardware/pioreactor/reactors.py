@@ -9,8 +9,8 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.logbook import Log, Logbook, no_log
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.doses import History
 from hardware.pioreactor.mailbox import Cluster, Mailbox
-from hardware.pioreactor.resume import History
 from hardware.pioreactor.station import Station
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.web import Web
@@ -39,7 +39,7 @@ class PioreactorReactors(Stations[Station, History]):
         self.config, self._real = config, real
         run = run or format(int(time.time()), "x")
         boxes = {unit: Mailbox(unit, config, real) for unit in config.reactors}
-        self.leader = Web(config.leader_address, config.experiment)
+        self.leader = Web((config.leader or f"http://{config.broker}").rstrip("/"), config.experiment)
         self.mqtt = Cluster(config, boxes, f"turbidostat-{run}-{config.reactors[0]}", real)
         self.stations = tuple(
             Station(

@@ -9,16 +9,15 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from hardware.errors import DeviceStateError, LinkError, ReactorError
-from hardware.pioreactor.doses import Doses, Plan
+from hardware.pioreactor.doses import Doses, History
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import AUTOMATIONS
 from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, boot_of
-from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.reactor import Fault
-from hardware.stations import Newest
+from hardware.stations import Newest, Plan
 
 __all__ = ["UNHEARD", "Station"]
 

@@ -129,16 +129,8 @@ class Rig:
         self.processes[name].kill()
         self.processes[name].wait()
 
-    def reboot(self, unit: str) -> None:
-        """Reboot a unit: its processes end at once, its pins fall to 0, what lay in memory is gone.
-
-        Raises: DeviceStateError if its web server does not come back.
-        """
-        self.cut(unit)
-        self.boot(unit)
-
     def cut(self, unit: str) -> None:
-        """Cut the power of a unit."""
+        """Cut the power of a unit: its processes end at once, its pins fall to 0, what lay in memory is gone."""
         for name in UNIT:
             self.kill(f"{unit} {name}")
         _kill(self.jobs(unit))
@@ -201,15 +193,11 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _listens(host: str, port: int) -> bool:
-    with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
-        return True
-    return False
-
-
 def _wait(host: str, port: int, what: str) -> None:
     deadline = time.monotonic() + BOOT_S
-    while not _listens(host, port):
+    while True:
+        with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
+            return
         if time.monotonic() > deadline:
             raise DeviceStateError(f"{what} of the rig did not start within {BOOT_S:.0f} s; look at its log")
         time.sleep(0.1)

@@ -21,7 +21,6 @@ class FeedBudget:
     """
 
     remembers = ("volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_paid_ml", "_unusable")
-    added = ("_paid_ml",)
 
     def __init__(self, config: SafetyConfig, bench: Bench, tube_ml: Array, full_ml: Array) -> None:
         self._config, self._bench, n = config, bench, len(tube_ml)

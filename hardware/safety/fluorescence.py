@@ -17,7 +17,7 @@ class Light:
     Args: n: number of reactors; config: limits.
     """
 
-    remembers = added = ("_light", "_light_repeats", "_light_s")
+    remembers = ("_light", "_light_repeats", "_light_s")
 
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config

@@ -214,10 +214,8 @@ class Interlock:
 
         Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
-        if isinstance(state, dict):
-            added = {key for part in self._parts for key in getattr(part, "added", ())}
-            if other := (added | set(state)) ^ set(self.state()):
-                raise ValueError(f"saved interlock has other fields: {', '.join(sorted(other))[:80]}")
+        if isinstance(state, dict) and (other := set(state) ^ set(self.state())):
+            raise ValueError(f"saved interlock has other fields: {', '.join(sorted(other))[:80]}")
         for part in (*self._parts, self):
             memory.restore(part, state, SAID)
         for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):

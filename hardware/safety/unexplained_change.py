@@ -29,7 +29,6 @@ class UnexplainedChange:
         "_od", "_at", "_since_ml", "_since_low_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
         "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
     )  # fmt: skip
-    added = ("_helpless_od", "_eased", "_since_low_ml")
 
     def __init__(self, config: SafetyConfig, max_rate: float, tube_ml: Array) -> None:
         self._config, self._max_rate, self._tube_ml, n = config, max_rate, tube_ml, len(tube_ml)

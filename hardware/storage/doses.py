@@ -153,7 +153,7 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
                 begun[name] = Dosed(row["n"], name, *_moved(row, "on_s"), pump=FEEDS[feeds_by(row)])
             elif kind == "feed_on" and name in begun:
                 given[begun[name].n] = begun[name]
-            elif kind == "given":  # beside our doses; earlier journals do not say the pump
+            elif kind == "given":  # beside our doses
                 repeated.append(Dosed(row["n"], name, *_moved(row, "at_s"), again=True, pump=int(row.get("pump", 1))))
             elif kind == "dose_end" and "feed_times" in row:
                 ending, pump = Ending.of_row(row), 1

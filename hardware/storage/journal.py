@@ -14,28 +14,29 @@ from hardware.clock import uptime
 from hardware.errors import RecordingError
 from hardware.storage.atomic import sync_folder
 
-__all__ = ["REMEDY", "Journal", "read_journal"]
+__all__ = ["REMEDY", "Journal", "plain", "read_journal"]
 
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
-    f'"kind":"{kind}"'.encode() for kind in ("device", "temperature", "regulate", "guard", "level", "share", "start")
+    f'"kind":"{kind}"'.encode()
+    for kind in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "start")
 )
 """Identities, blanks, targets, hand-overs, overflow pumps, levels, counted shares, starts: valid for days."""
 
 
-def _plain(value: Any) -> Any:
-    """Arrays as lists, non-finite numbers as None: what strict JSON can hold."""
+def plain(value: Any) -> Any:
+    """Convert a value to JSON's types: arrays and tuples to lists, keys to text, non-finite numbers to null."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        if all(type(v) is float and math.isfinite(v) for v in value):
+            return value
+        return [plain(v) for v in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _complete(data: bytes) -> int:
@@ -141,7 +142,7 @@ class Journal:
             raise RecordingError(f"journal {self.path}: written to after it was closed")
         self._count_interrupted()
         row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(uptime(), 3), "kind": kind}
-        line = json.dumps(_plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        line = json.dumps(plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             written = os.write(self._file, line)
             if written != len(line):

@@ -187,7 +187,7 @@ def _cells(lines: Iterable[str], notes: list[str]) -> Iterator[list[str]]:
 
 def _layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[int]) -> Layout:
     """Recognise the columns from the first line. Raises: RecordingError naming what was looked for and found."""
-    if not all(map(_is_number, first)):
+    if not all(cell.strip().lower() == "nan" or not math.isnan(_number(cell)) for cell in first):
         return _named_layout(path, first, pump_ml_s, pumps)
     if len(first) == 3:
         return Layout("three columns without header (min, OD, mL/s)", 0, 1, None, (2,), 1.0, 1.0, None)
@@ -253,10 +253,6 @@ def _number(cell: str) -> float:
     except ValueError:
         return math.nan
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
-def _is_number(cell: str) -> bool:
-    return cell.strip().lower() == "nan" or not math.isnan(_number(cell))
 
 
 class _Read(NamedTuple):

@@ -38,7 +38,7 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     began = time.monotonic()
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
-            save_calibration(folder / "calibration", name, part, pump.as_dict())
+            save_calibration(folder / "calibration", name, part, asdict(pump))
     found, stop = [], threading.Event()
     with ThreadPoolExecutor(config.workers) as executor:
         futures = [executor.submit(one_run, config, folder, run, stop) for run in range(config.runs)]

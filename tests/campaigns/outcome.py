@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import files
 from experiments.reporting.tables import markdown
 from tests.campaigns.fault import Fault
 from tests.campaigns.tracking import BAND_OD
+from tests.studies.results import write_csv
 
 NOTHING_ML = 0.1  # less than the smallest dose
 SHARE, SLACK_ML = 0.05, 0.1  # of a volume, and in all, by which a sound pump's timing is off in real time
@@ -287,4 +287,4 @@ def write_cases(path: Path, outcomes: Sequence[Outcome]) -> None:
     for row in (o.as_dict() for o in outcomes):
         counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
         rows.append({**row, **counts, "wrong": ", ".join(row["wrong"])})
-    files.write_csv(path, rows)
+    write_csv(path, rows)

@@ -133,6 +133,11 @@ def plant(part: str, switch: str, value: float) -> Act:
     return act
 
 
+def reboot(t: Trial) -> None:
+    t.rig.cut(FAULTED)
+    t.rig.boot(FAULTED)
+
+
 def swapped(t: Trial) -> None:
     """The address of the sick unit leads to the other."""
     t.words.append(f"backend.units.{FAULTED}.address={t.rig.web[WELL]}")
@@ -164,7 +169,7 @@ KILLS = (
     ),
     rig(
         "reader_killed", "kill -9 of od_reading, mended by a reboot", kill_job("od_reading"),
-        lambda t: t.rig.reboot(FAULTED), ("between", "in"), 30.0,
+        reboot, ("between", "in"), 30.0,
         by=("takes no OD readings",), within_s=30.0, blind=True,
     ),
     rig("queue_killed", "kill -9 of the task queue", *process("tasks"), ("between", "in"),
@@ -223,9 +228,9 @@ OTHERS = (
              lambda t: t.post("/active_calibrations/media_pump", method="DELETE"),
              lambda t: t.post("/active_calibrations/media_pump/rig-media_pump", method="PATCH"),
              by=("accepted and not carried out", "fate of a dose")),
-    rig("unit_rebooted", "the unit loses its power and boots", lambda t: t.rig.reboot(FAULTED), seconds=1.0,
+    rig("unit_rebooted", "the unit loses its power and boots", reboot, seconds=1.0,
              by=("takes no OD readings", "does not list", "no dose"), within_s=30.0, blind=True),
-    rig("rebooted_in_a_dose", "the same in a dose", lambda t: t.rig.reboot(FAULTED), moments=("in",), seconds=1.0,
+    rig("rebooted_in_a_dose", "the same in a dose", reboot, moments=("in",), seconds=1.0,
              by=("takes no OD readings", "counted whole", "ended early"), within_s=40.0, blind=True),
     rig("sensor_stuck", "the reading stands still", held, vial(held_od=float("nan")), seconds=75.0,
              why_not="the vendor's noise stays on it; the interlock knows it by what doses do not do",

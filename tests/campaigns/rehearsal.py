@@ -30,7 +30,7 @@ from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.transport import EmulatorTransport
 from hardware.safety.config import SafetyConfig
 
-__all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock", "rehearsed"]
+__all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock", "StandIn", "rehearsed"]
 
 SOUND = ReactorCalibration(
     PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
@@ -40,6 +40,19 @@ SOUND = ReactorCalibration(
 
 class Killed(BaseException):
     """SIGKILL: nothing of the program runs any more, least of all what it would do on an error."""
+
+
+class StandIn:
+    """A controller in the place of another one, whose memory it keeps: a resumed run goes on with that."""
+
+    def __init__(self, inner: Any) -> None:
+        self.remembers = getattr(inner, "remembers", ())
+        self.inner, self.reset = inner, inner.reset
+
+    def __getattr__(self, name: str) -> Any:
+        if name.removeprefix("_") not in [key.removeprefix("_") for key in self.remembers]:
+            raise AttributeError(name)
+        return getattr(self.inner, name)
 
 
 class ScriptedClock(VirtualClock):

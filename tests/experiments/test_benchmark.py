@@ -18,8 +18,7 @@ from experiments.comparison import run as comparison_run
 from experiments.comparison import statistics as comparison
 from experiments.comparison import studies
 from experiments.comparison import trials as trials_module
-from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.published import TABLE_2
+from experiments.comparison.config import TABLE_2, BenchmarkConfig
 from experiments.comparison.run import learned, with_seeds
 from experiments.comparison.trials import Cell, DensityTrial, Loops, cells, run_trial, windows
 from experiments.laws import registry
@@ -32,7 +31,6 @@ pytestmark = pytest.mark.numeric
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("benchmark")  # its tests share loops
 EVERY = ("dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold", "oracle")
-FEEDBACK = ("dqn", "pi_tuned", "mpc", "adaptive_inverse")
 
 
 @cache

@@ -17,7 +17,7 @@ from envs.plant.plant import Plant, of_pair
 from experiments import calibrate_pair as command
 from experiments.calibrate_pair import CalibratePairConfig, _growth, _pigment, _plateaus, _say, calibrate_pair
 from experiments.cli import frame
-from experiments.reporting import charts, pair_charts
+from experiments.reporting import charts, composition_charts
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
 
@@ -309,7 +309,7 @@ def test_a_pair_holds_where_both_were_recorded_and_says_by_what(
         return first if paths == ("a.csv", "c.csv") else second
 
     monkeypatch.setattr(command, "_plateaus", plateaus)
-    monkeypatch.setattr(pair_charts, "pair_figure", lambda pair, points: "drawn")
+    monkeypatch.setattr(composition_charts, "pair_figure", lambda pair, points: "drawn")
     saved: list[tuple[object, ...]] = []
     monkeypatch.setattr(charts, "save", lambda *given: saved.append(given))
     config = CalibratePairConfig(("a.csv", "c.csv"), ("b.csv",), ("alpha", "beta"), lags_min=(5.0, 40.0))

@@ -11,11 +11,10 @@ import pytest
 
 from dqn.policy import Policy
 from envs.task import EnvConfig
-from experiments.certification.boxes import contradictions, possible
+from experiments.certification.boxes import contradictions, on_lines, possible
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Pieces, drops, images, points_in_strips
 from experiments.certification.judge import SAFETY, _count, _required, _worst, certify, recheck
-from experiments.certification.line import on_lines
 from experiments.certification.network import Network, q_values, rounding
 from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.polygons import Regions, area, partition

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
 from experiments.control import assemble
-from experiments.control.bench_marks import BenchMarks
+from experiments.control.run import BenchMarks
 from experiments.laws import registry
 from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
@@ -181,7 +181,7 @@ def test_processes_killed_and_resumed_lose_nothing(tmp_path: Path, monkeypatch: 
     config = KillConfig(kills=3, runs=1, workers=1, reactors=("M0", "M1"), overrides=words, plant="coculture", **pace)
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
-            save_calibration(tmp_path / "calibration", name, part, pump.as_dict())
+            save_calibration(tmp_path / "calibration", name, part, asdict(pump))
     found = killed_run(config, 3, tmp_path / "run0", 0)
     assert found.ok, found
     assert found.lives == 4

@@ -1,6 +1,5 @@
 """The composition's estimator against a dense reference, the plant's truth, and what may not move it."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +26,6 @@ from experiments.laws.share.estimator import (
     CompositionEstimatorConfig,
 )
 from experiments.laws.share.program import Program
-from hardware import memory
 from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 
 pytestmark = pytest.mark.numeric
@@ -162,21 +160,6 @@ def test_what_is_considered_never_moves_and_always_counts():
     assert unsure.cov[0, 0, FACTOR, FACTOR] == pytest.approx(0.13**2, rel=1e-9)
     assert unsure.cov[0, 0, OFFSET, OFFSET] == pytest.approx(45.0**2, rel=1e-9)
     assert unsure.estimate().sd[0] > 1.5 * sure.estimate().sd[0]
-
-
-def test_a_state_that_was_saved_goes_on_to_the_bit():
-    rng, seen = np.random.default_rng(3), readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 90)
-    seen = seen + rng.normal(size=seen.shape) * [0.005, 30.0]
-    whole, first, second = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(3))
-    follow(whole, seen)
-    follow(first, seen[:40])
-    memory.restore(second, json.loads(json.dumps(memory.save(first))), memory.words("estimator"))
-    for k in range(40, len(seen)):
-        second.watch(*(np.array([v]) for v in (*seen[k], WARM, float(k))), rows=np.array([True]))
-        second.dosed(np.array([DOSE_ML]))
-    np.testing.assert_array_equal(second.mean, whole.mean)
-    np.testing.assert_array_equal(second.cov, whole.cov)
-    assert memory.save(second) == memory.save(whole)
 
 
 def test_a_gap_is_as_many_minutes_without_readings():

@@ -164,18 +164,6 @@ def test_nothing_beats_the_optimum_over_the_program_and_foresight_pays():
     assert blind > 1.5 * best
 
 
-def test_every_law_goes_on_to_the_bit_from_what_it_saved():
-    for kind in ("pi", "midpoint", "myopic", "optimum"):
-        whole, second = law(kind), law(kind)
-        moves = [(m, 0.2 * np.sin(m / 7.0)) for m in range(60, 160)]
-        for m, x in moves[:50]:
-            whole.act(seen(x), STEPS.wanted(np.array([float(m)]), 360.0), *at(m))
-        memory.restore(second, json.loads(json.dumps(memory.save(whole))), memory.words("law"))
-        for m, x in moves[50:]:
-            told = STEPS.wanted(np.array([float(m)]), 360.0)
-            assert whole.act(seen(x), told, *at(m))[0] == second.act(seen(x), told, *at(m))[0], kind
-
-
 def linear_policy(names, column, control_min=10.0):
     """Prefers the second of two temperatures, 30 and 35 degC, where one number of the observation is above 0."""
     weight = np.zeros((len(names), 2), dtype=np.float32)

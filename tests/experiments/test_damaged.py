@@ -60,10 +60,6 @@ def refused(run: Rehearsal, *said: str) -> None:
         assert path.read_bytes().startswith(content)
 
 
-def of(key: str, value: Any) -> Change:
-    return lambda state: state["interlock"].update({key: value})
-
-
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -71,36 +67,18 @@ def of(key: str, value: Any) -> Change:
         ("", "not JSON"),
         ("[" * 100_000, "not JSON"),
         ("[]", "it holds [], expected keys and values"),
-        ("null", "it holds None"),
         (lambda s: s.pop("journal_row"), "journal_row: missing, expected the number of a row"),
         (lambda s: s.update(journal_row="7"), "journal_row: 7, expected"),
         (lambda s: s.update(journal_row=True), "journal_row: True, expected"),
-        (lambda s: s.pop("began"), "began: missing, expected a list of numbers"),
         (lambda s: s.update(began=5), "began: 5, expected a list of numbers"),
-        (lambda s: s.update(began=["0"]), "began: ['0'], expected a list of numbers"),
-        (lambda s: s.update(done=[0]), "done: [0], expected a list of true or false"),
         (lambda s: s.update(stopped=[False] * 2), "stopped is for 2 reactors, this run has 1"),
         (lambda s: s.pop("interlock"), "saved interlock: missing"),
         (lambda s: s.update(interlock=[1]), "saved interlock: [1]"),
         (lambda s: s["interlock"].pop("fed_ml"), "saved interlock has other fields: fed_ml"),
-        (of("fed_ml", ["x"]), "saved interlock: fed_ml = ['x']: expected numbers"),
-        (of("fed_ml", [10**400]), "saved interlock: fed_ml = [1000"),
-        (of("fed_ml", [None]), "saved interlock: fed_ml = [None]: expected finite numbers"),
-        (of("fed_ml", 1.0), "saved interlock: fed_ml has the shape (), expected (1,)"),
-        (of("fed_ml", [1.0, 2.0]), "saved interlock is for 2 reactors, this run has 1"),
-        (of("_latched", [7]), "saved interlock: _latched = [7]: no such code"),
-        (of("_hold_kind", [99]), "saved interlock: _hold_kind = [99]: no such code"),
+        (lambda s: s["interlock"].update(fed_ml=["x"]), "saved interlock: fed_ml = ['x']: expected numbers"),
+        (lambda s: s.pop("controller"), "controller: missing, expected keys and values"),
         (lambda s: s.update(controller="warm"), "controller: warm, expected keys and values"),
-        (lambda s: s.update(controller=None), "controller: None, expected keys and values"),
-        (lambda s: s.update(controller={}), "controller.mean: missing"),
         (lambda s: s["controller"].update(estimator=[1]), "controller.mean: missing"),
-        (lambda s: s["controller"]["estimator"].pop("cov"), "controller.cov: missing"),
-        (
-            lambda s: s["controller"]["estimator"].update(mean=[[0.0]]),
-            "controller.mean has shape (1, 1), this run needs",
-        ),
-        (lambda s: s["controller"]["estimator"].update(far=[None]), "controller.far: [None], expected numbers"),
-        (lambda s: s["controller"].update(rate=[10**400]), "controller.rate: [1000"),
     ],
 )
 def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str) -> None:
@@ -118,9 +96,6 @@ def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str
     ("kind", "change", "why"),
     [
         ("sample", lambda r: r.pop("kind"), "a row without a usable kind"),
-        ("start", lambda r: r.update(wall="noon"), "a row without a usable wall"),
-        ("start", lambda r: r.update(wall=float("nan")), "a row without a usable wall"),
-        ("intent", lambda r: r.update(n="7"), "a row without a usable n"),
         ("intent", lambda r: r.update(sample=None), "(intent) is damaged (TypeError"),
         ("intent", lambda r: r.pop("feed_ml"), "is damaged (KeyError: 'feed_ml')"),
         ("intent", lambda r: r.pop("waste_ml"), "(intent) is damaged (KeyError: 'waste_ml')"),
@@ -134,8 +109,6 @@ def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str
 def test_a_journal_row_that_was_damaged(run: Rehearsal, kind: str, change: Change, why: str) -> None:
     path = run.folder / "journal.jsonl"
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    if kind == "start":  # written by deploy, not here
-        rows.insert(0, {**rows[0], "kind": "start"})
     change(next(row for row in rows if row["kind"] == kind))
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     refused(run, "journal", why, "put it back as the run wrote it, or start a new run")

@@ -29,7 +29,6 @@ from experiments.laws import registry
 from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
 from experiments.record.curves import Curves
-from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
 from hardware.family import family_of
 from hardware.reactor import Command
@@ -346,32 +345,6 @@ def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Scenario((0.5,), (5.0,), (37.0,)))
     loop.began[:] = 0.0
     assert all(step.rate[0] == 0.0 for step in loop.run())
-
-
-def handing_over(lab: DriverLab) -> ClosedLoop:
-    """A loop whose interlock hands every reactor over once its budget is spent."""
-    safety = SafetyConfig(ml_per_hour=1.0, responses=Responses(budget="regulate"))
-    schedule = Scenario((0.5,), (600.0,), (37.0,))
-    return ClosedLoop(lab.reactors, LearnedController(inverse_policy()), Interlock(len(lab.names), safety), schedule)
-
-
-def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
-    lab = DriverLab(od=0.55)
-    lab.reactors.begin()
-    loop = handing_over(lab)
-    while lab.clock.now() < 900.0:
-        loop.step()
-    assert loop.reactors.handed_over.all()
-    assert lab.device.apps["M0"].data["OD"]["ON"] == 1
-    state = json.loads(json.dumps(loop.state()))
-    lab.client()
-    lab.reactors.begin(replay(json.loads(json.dumps(lab.rows))), lab.clock.now())
-    again = handing_over(lab)
-    again.restore(state)
-    while lab.clock.now() < 3600.0:
-        again.step()
-    assert lab.device.apps["M0"].data["OD"]["ON"] == 1
-    assert lab.truth()["od"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp_path, monkeypatch):

@@ -36,8 +36,8 @@ from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
 from experiments.record.record import Table
 from experiments.record.summary import composition_figure_of, figure_of
 from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
-from experiments.reporting.agreement_chart import agreement_figure
-from experiments.reporting.pair_charts import pair_figure
+from experiments.reporting.calibration_charts import agreement_figure
+from experiments.reporting.composition_charts import pair_figure
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 

@@ -12,15 +12,15 @@ from experiments.laws.base import Array, Controller, Mask
 from hardware.emulator.faults import inject
 from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
-from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Killed, Rehearsal, StandIn, rehearsed
 
 
-class Losing:
+class Losing(StandIn):
     """A sound controller that is lost for the first reactor after some samples, and says when it has been for five."""
 
     def __init__(self, inner: Controller, run: "Losable") -> None:
-        self.inner, self.run = inner, run
-        self.reset = inner.reset
+        super().__init__(inner)
+        self.run = run
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         rate = self.inner.act(od, setpoint, minute, rows)

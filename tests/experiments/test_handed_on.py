@@ -13,7 +13,7 @@ import pytest
 
 from envs.coculture.pair import named_pair
 from envs.coculture.task import SCALES, CocultureConfig
-from experiments.cli import choices, extensions, files, frame, latest, start
+from experiments.cli import extensions, files, frame, latest, start
 from experiments.cli.calibrated import read_curves
 from experiments.cli.help_page import shown
 
@@ -131,7 +131,7 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(
 
 def test_a_run_folder_tells_its_presets_and_the_words_it_was_started_with(tmp_path: Path) -> None:
     """Hydra's own groups and those without a preset are none; a word stands as it was typed, whatever it holds."""
-    assert (choices.choices(tmp_path), choices.given(tmp_path)) == ({}, [])
+    assert (files.choices(tmp_path), files.given(tmp_path)) == ({}, [])
     (tmp_path / ".hydra").mkdir()
     (tmp_path / ".hydra" / "hydra.yaml").write_text(
         "hydra:\n  runtime:\n    version: 1.3\n    choices:\n      composition: null\n      plant: bench\n"
@@ -139,16 +139,10 @@ def test_a_run_folder_tells_its_presets_and_the_words_it_was_started_with(tmp_pa
         "  verbose: false\n"
     )
     chosen = {"plant": "bench", "backend/transport": "serial", "scenario": "day"}
-    assert choices.choices(tmp_path) == chosen
+    assert files.choices(tmp_path) == chosen
     words = ["plant=bench", "++each.M1.minutes=[90,30]", "+env=sim", "scenario.until=['od >= 0.8']"]
     (tmp_path / ".hydra" / "overrides.yaml").write_text("".join(f"- {word}\n" for word in words))
-    assert choices.given(tmp_path) == [word.lstrip("+") for word in words]
-
-
-def test_rows_are_written_under_the_names_of_the_first(tmp_path: Path) -> None:
-    rows = [{"name": "a", "ml": 1.5, "od": None}, {"od": 0.4, "ml": 2.5, "name": "b, c"}]
-    files.write_csv(tmp_path / "rows.csv", rows)
-    assert (tmp_path / "rows.csv").read_text().splitlines() == ["name,ml,od", "a,1.5,", '"b, c",2.5,0.4']
+    assert files.given(tmp_path) == [word.lstrip("+") for word in words]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 from envs.plant.sensor import od_from_counts
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.control.bench_marks import BenchMarks
+from experiments.control.run import BenchMarks
 from experiments.loop.loop import Step
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command

@@ -147,19 +147,6 @@ def test_each_learned_law_of_a_share_has_a_policy_of_its_own_that_ships(tmp_path
     assert not (tmp_path / COMPOSITION_POLICY).exists()
 
 
-def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    given = laws.law()
-    model = {key: value for key, value in given.metadata["model"].items() if key != "setpoints"}
-    said = {**given.metadata, "model": model, "regret_pct": 0.1}  # its regret and its control period
-    written(tmp_path / "given.npz", replace(given, metadata=said))
-    config = DeployConfig(backend=ChiBioConfig(), policy=str(tmp_path / "given.npz"))
-    with caplog.at_level("INFO"):
-        assemble.unpack(config, tmp_path)
-    assert "it does not say updates, trained setpoints: an earlier version wrote it" in caplog.text
-
-
 def test_each_step_of_the_demo_takes_what_the_step_before_it_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """Calibrated, trained on that, certified, run by the device, reported as one; a step that fails is the last one."""
     place = Path("runs/demo/now")

@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.comparison import figures, page
-from experiments.comparison.published import SETTLING_MIN, TABLE_2
+from experiments.comparison.config import SETTLING_MIN, TABLE_2
 
 CONTROLLERS = ("dqn", "pi", "mpc")
 ISE = {

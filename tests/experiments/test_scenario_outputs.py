@@ -283,15 +283,12 @@ def test_what_the_interlock_holds_is_held_for_a_spare_pump_too(tmp_path: Path) -
     assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.25)
 
 
-def test_a_saved_state_goes_on_and_a_damaged_one_is_named() -> None:
+def test_a_saved_state_goes_on() -> None:
     hourly = [Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))]
     first, second = Supply(hourly, 1.2), Supply(hourly, 1.2)
     given(first, range(10))
     memory.restore_rows(second, json.loads(json.dumps(memory.rows(first))), "supply")
     assert given(second, range(10, 16)) == [(15.0, 3, 0.5)]
-    for damaged in ("missing", [], [{}], [{"owed_ml": [1.0], "supplied_at": 0.0, "supplied_step": 0}]):
-        with pytest.raises(ValueError, match="supply: "):
-            memory.restore_rows(second, damaged, "supply")
 
 
 def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path) -> None:

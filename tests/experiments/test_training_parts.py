@@ -289,34 +289,6 @@ def test_an_agent_of_a_population_is_the_same_seed_alone(env: str, agent: str) -
     assert not torch.allclose(many.weights()[2], many.weights()[3])
 
 
-def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Killed after step 96, before that was saved: it goes on at 72, and has every line of its progress once."""
-    config: dict[str, Any] = {**THREE, "checkpoint_every": 72}
-    agent = config.pop("agent")
-    first = session(tmp_path / "a", agent=agent, **config)
-    first.run()
-    first.writer.close()
-    for total in (72, 96):
-        second = session(tmp_path / "b", total > 72, agent=replace(agent, total_steps=total), **config)
-        second.run()
-        second.writer.close()
-        if total == 72:
-            saved = (tmp_path / "b" / "checkpoint.pt").read_bytes()
-    (tmp_path / "b" / "checkpoint.pt").write_bytes(saved)
-    third = session(tmp_path / "b", True, agent=agent, **config)
-    assert third.agents.steps == 72
-    third.run()
-    third.writer.close()
-    assert torch.equal(first.agents.weights(), third.agents.weights())
-    assert first.best.history == third.best.history
-    assert [step for step, _, _ in first.best.history] == [48, 72, 96, 120]
-    whole, resumed = (
-        [line for line in (tmp_path / name / "progress.csv").read_text().splitlines() if ",speed/" not in line]
-        for name in "ab"
-    )
-    assert whole == resumed
-
-
 @pytest.mark.parametrize(
     ("regret", "steady", "said"),
     [

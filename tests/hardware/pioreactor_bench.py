@@ -14,9 +14,9 @@ from envs.bench import Bench
 from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, UnitConfig
+from hardware.pioreactor.doses import replay
 from hardware.pioreactor.pumps import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.resume import replay
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.reactor import Command
 from hardware.rig.build import environment, home, missing

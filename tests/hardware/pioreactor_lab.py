@@ -20,9 +20,9 @@ from hardware.clock import VirtualClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.pioreactor import reactors
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.doses import History
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import NotHeard, Web
 from hardware.reactor import Command, Measurement
 from hardware.safety.budget import FeedBudget

@@ -144,7 +144,6 @@ def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
         ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}),
         ({"M1": {"Pump1": 3.0}}, {}),
         ({}, {}),
-        (None, None),
     ):
         script.switched_off = lambda said=said: said  # type: ignore[method-assign, misc]
         assert m0.switched_off() == own

@@ -11,8 +11,7 @@ import pytest
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.context import Context
-from hardware.chibio.dose_sequence import DoseSequence
+from hardware.chibio.dose_sequence import Context, DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.protocol import Permitted
 from hardware.chibio.resume import ReactorHistory
@@ -180,7 +179,7 @@ def test_what_stands_in_the_way_of_a_dose(sample: Any, past_s: float, refusal: s
     bench.run()
     assert bench.begin() == DosePlan()
     assert "no new sample" in bench.book.notes[2]
-    bench.doses.forget_sample()
+    bench.doses.acted = None
     assert bench.begin().feed_ml > 0.0
 
 

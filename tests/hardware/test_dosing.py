@@ -2,6 +2,7 @@
 
 import math
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def test_ranges_of_a_pump(key: str, low: float, high: float) -> None:
 
 
 def test_a_pump_nobody_weighed() -> None:
-    assert NOMINAL.as_dict() == {
+    assert asdict(NOMINAL) == {
         "flow_ml_s": 1.0, "bias_s": 0.0, "spread": 0.1, "min_on_s": 0.3, "date": "", "device_id": "",
     }  # fmt: skip
     weighed = PumpCalibration(date="2026-02-03")
@@ -191,7 +192,7 @@ def test_weighings_that_make_no_line_are_refused(on_s: list[float], grams: list[
 
 def test_a_stored_calibration_reads_back() -> None:
     pump = PumpCalibration(0.9, 0.05, 0.08, 0.4, "2026-02-03", "1000200030004000")
-    assert PumpCalibration.from_dict({**pump.as_dict(), "weighings": []}) == pump
+    assert PumpCalibration.from_dict({**asdict(pump), "weighings": []}) == pump
     for wrong in (70.0, None, "fast"):
         with pytest.raises(ValueError, match=r"flow_ml_s|pump calibration.*weigh|fast"):
             PumpCalibration.from_dict({"flow_ml_s": wrong})
@@ -211,8 +212,8 @@ def test_each_reactor_s_pumps_and_blank_are_those_of_its_own_files(tmp_path: Pat
     feeds = {"M0": PumpCalibration(0.8, 0.02, date="2026-01-01"), "M3": PumpCalibration(0.6, date="2026-01-02")}
     waste = PumpCalibration(1.3, -0.05, 0.2, 0.5, "2026-01-03", "77")
     for name, feed in feeds.items():
-        assert save_calibration(tmp_path / "new", name, "feed", feed.as_dict()).name == f"{name}_feed.yaml"
-    save_calibration(tmp_path / "new", "M3", "waste", waste.as_dict())
+        assert save_calibration(tmp_path / "new", name, "feed", asdict(feed)).name == f"{name}_feed.yaml"
+    save_calibration(tmp_path / "new", "M3", "waste", asdict(waste))
     save_calibration(tmp_path / "new", "M3", "blank", {"blank": 14250.5, "sd": 30.0})
     first, third, seventh = load_calibrations(tmp_path / "new", ("M0", "M3", "M7"))
     assert (first.feed, first.waste) == (feeds["M0"], PumpCalibration())

@@ -168,14 +168,6 @@ def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(overflow_pump: str, lev
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level + 1.0 + BIAS_S)
 
 
-def test_feed_dilutes_by_what_it_adds() -> None:
-    lab = Lab(od=0.8)
-    lab.pump("Pump2", 1.0)
-    lab.pump("Pump1", 2.0 / 63.0)
-    lab.wait(20.0)
-    assert lab.device.truth("M0")["od"] == pytest.approx(0.8 * np.exp(-(2.0 + BIAS_S) / 20.0), rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("fault", "value", "delivered"),
     [

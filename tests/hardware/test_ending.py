@@ -190,9 +190,6 @@ def test_repetitions_are_told_one_by_one_and_survive_the_journal() -> None:
     assert ending.repeats() == [(73.0, 0.4, 9.0), (136.0, 0.0, 3.0)]
     assert Ending.of_row(json.loads(json.dumps(ending.row()))) == ending
     assert ending.row()["repeated_ml"] == 0.4
-    earlier = Ending.of_row({"on_s": 10.0, "feed_ml": 1.2, "waste_ml": 9.0, "feed_times": 2, "waste_times": 2})
-    assert earlier.repeats() == [(73.0, 1.2, 9.0), (136.0, 1.2, 9.0)]  # a journal of an earlier version
-    assert earlier.least == 1.0
 
 
 def test_every_dose_of_a_journal_in_the_order_of_time() -> None:

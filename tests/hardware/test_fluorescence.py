@@ -10,7 +10,6 @@ import pytest
 
 from envs.plant.plant import Plant
 from hardware.board.board_agent import reduce_sysdata
-from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
@@ -18,6 +17,7 @@ from hardware.chibio.preflight import preflight
 from hardware.chibio.protocol import Permitted, check_command, parse_state
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.errors import DeviceStateError
+from hardware.family import Check
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import Lab

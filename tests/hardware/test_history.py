@@ -7,7 +7,7 @@ import pytest
 
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
-from hardware.pioreactor.resume import replay as units
+from hardware.pioreactor.doses import replay as units
 from hardware.storage.doses import Ending, Given, dosed
 
 
@@ -30,7 +30,7 @@ def test_nothing_is_known_of_a_reactor_without_rows_and_a_dose_may_have_given_no
     assert Ending(100.0, 0.5, 6.0, 2, 0).repeats() == [(163.0, 0.5, 0.0), (226.0, 0.5, 0.0)]
 
 
-def test_what_was_given_beside_says_by_which_pump_and_how_little_and_earlier_journals_did_not():
+def test_what_was_given_beside_says_by_which_pump_and_how_little():
     old = row(3, "given", at_s=398.0, feed_ml=0.6, waste_ml=0.6, why="heard late")
     new = Given(398.0, 0.6, 0.1, 0.6, pump=3).row("heard late")
     assert new == {"at_s": 398.0, "feed_ml": 0.6, "feed_low_ml": 0.1, "waste_ml": 0.6, "pump": 3, "why": "heard late"}
@@ -117,12 +117,13 @@ def test_what_later_rows_say_of_a_dose() -> None:
     assert begun.wasted  # it may run
     assert begun.feed_s == pytest.approx(0.63)
     assert begun.waste_s == pytest.approx(6.3)
-    assert replay([row(1, "guard")])["M0"].overflow_pump_on
+    assert replay([row(1, "overflow_pump")])["M0"].overflow_pump_on
     assert not ReactorHistory().overflow_pump_on
     assert replay([row(1, "regulate", setpoint=0.5)])["M0"].handed_over == 0.5
     taken_back = replay([row(1, "regulate", setpoint=0.5), row(2, "regulate", setpoint=None)])["M0"]
     assert taken_back.handed_over != taken_back.handed_over
-    for damaged in (row(9, "intent"), row(9, "regulate"), row(9, "device", blank="much"), {"n": 9, "kind": "guard"}):
+    nameless = {"n": 9, "kind": "overflow_pump"}
+    for damaged in (row(9, "intent"), row(9, "regulate"), row(9, "device", blank="much"), nameless):
         with pytest.raises(RecordingError, match=r"row 9 \(.*\) is damaged .*; the file was changed by hand"):
             replay([damaged])
     assert replay([{"n": 1, "kind": "note"}]) == {}

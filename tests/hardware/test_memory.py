@@ -38,7 +38,6 @@ LAWS = {
 }  # fmt: skip
 ANEW = {"_fresh_s"}  # of the interlock: begins anew in a resumed run
 BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them than type and shape
-LATER = {"one_line", "_paid_ml", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
 STREAM: dict[str, Any] = dict(np.random.default_rng(0).bit_generator.state)
 PATH = tuple[Any, ...]
 ONCE = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
@@ -128,11 +127,8 @@ def test_what_is_missing_is_named(kind: str) -> None:
             continue  # all else is the same whoever controls
         state = copy.deepcopy(whole)
         del at(state, path[:-1])[path[-1]]
-        if path[-1] in LATER:
-            unused(kind).restore(state)
-        else:
-            refused(kind, state, path[-1])
-    for key in whole.keys() - {"controller"}:
+        refused(kind, state, path[-1])
+    for key in whole:
         refused(kind, {k: v for k, v in whole.items() if k != key}, key)
 
 

@@ -81,7 +81,7 @@ def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
 def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_the_end() -> None:
     lab = guarded()
     assert runs(lab)
-    assert [(row["pump"], row["duty"], row["found"]) for row in lab.of("guard")] == [("Pump3", 0.5, "off")]
+    assert [(row["pump"], row["duty"], row["found"]) for row in lab.of("overflow_pump")] == [("Pump3", 0.5, "off")]
     lab.run(20)
     assert len(lab.of("intent")) >= 15
     assert posts(lab) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hardware.errors import DeviceStateError, LinkError, RecordingError
+from hardware.pioreactor.doses import History, replay
 from hardware.pioreactor.pumps import LATE_ML
-from hardware.pioreactor.resume import History, replay
 from hardware.pioreactor.versions import TESTED
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal

@@ -16,11 +16,11 @@ from hardware.errors import DeviceStateError, LinkError
 from hardware.family import Opening
 from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
+from hardware.pioreactor.doses import replay
 from hardware.pioreactor.family import FAMILY
 from hardware.pioreactor.jobs import flow, regulates, request
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.resume import replay
 from hardware.pioreactor.station import UNHEARD
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.pioreactor.web import Web

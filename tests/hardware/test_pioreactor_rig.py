@@ -45,7 +45,8 @@ def test_the_remedy_of_the_preflight_for_a_killed_dose_works(bench):
         bench.clear_the_lock()
         bench.pio(*forget.split()[1:], "--job-name", "add_media")
     else:
-        bench.rig.reboot(UNIT)
+        bench.rig.cut(UNIT)
+        bench.rig.boot(UNIT)
     bench.live()
     assert bench.settled(200.0)
     assert bench.sample(90.0)
@@ -81,7 +82,8 @@ def test_stirring_and_thermostat_run_follow_their_target_and_come_back_after_a_r
     bench.station.set_temperature(33.0)
     assert bench.go_on(20.0, lambda: box.target == 33.0)
     assert bench.target() == 33.0
-    bench.rig.reboot(UNIT)
+    bench.rig.cut(UNIT)
+    bench.rig.boot(UNIT)
     assert bench.go_on(30.0, lambda: bench.station.book.fault is not None)
     assert bench.go_on(90.0, running)
     assert bench.target() == 33.0

@@ -266,8 +266,6 @@ def test_two_units_have_their_own_values(monkeypatch):
     assert sampling.look(6.0, 0.0).od == pytest.approx(2.5 * 0.4)
     config = RigBackendConfig(units={"pio01": UnitConfig(address="http://10.0.0.1/")})
     assert [config.address(name) for name in ("pio01", "pio02")] == ["http://10.0.0.1", "http://pio02.local"]
-    for leader, address in (("", "http://lead.local"), ("http://10.0.0.9/", "http://10.0.0.9")):
-        assert PioreactorConfig(broker="lead.local", leader=leader).leader_address == address
 
 
 @pytest.mark.parametrize("calibrated", [False, True])

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from envs.bench import Bench
-from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.preflight import _board_clock, _disk, _link, _reactor, preflight
 from hardware.chibio.protocol import parse_state
 from hardware.clock import VirtualClock
+from hardware.family import Check
 from hardware.link.transport import Reply
 from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab, begun

@@ -119,15 +119,10 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
 
 def test_looks_are_as_far_apart_as_is_set() -> None:
     clock = VirtualClock(500.0)
-    sampling = Sampling(replace(CONFIG, poll_s=7.0, retry_s=11.0), clock)
+    sampling = Sampling(replace(CONFIG, poll_s=7.0), clock)
     assert sampling.next_poll == sampling.arrived_s == 500.0
     sampling.look(sample(math.nan, 0), 500.0)
     assert sampling.next_poll == 507.0
-    sampling.retry_later()
-    assert sampling.next_poll == 511.0
-    clock.sleep(40.0)
-    sampling.wait_from_now()
-    assert (sampling.next_poll, sampling.arrived_s) == (540.0, 540.0)
 
 
 def test_a_sample_is_made_of_its_own_numbers() -> None:

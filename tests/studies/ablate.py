@@ -21,7 +21,7 @@ from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.training.config import TrainConfig
 from tests.entry import command
-from tests.studies.results import leave
+from tests.studies.results import leave, write_csv
 from tests.studies.variants import seeds, variant
 
 __all__ = ["AblateConfig", "Row", "main", "summarise"]
@@ -181,7 +181,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             continue
         log.info("variant %d of %d: %s %s", k + 1, len(config.names), name, config.ablations[name])
         rows += _train(config.training(name), name, folder / name)
-        files.write_csv(path, [asdict(row) for row in rows])
+        write_csv(path, [asdict(row) for row in rows])
         entry = summarise(rows)[name]
         regret, steady, last = (entry[m] for m in MEASURES[:3])
         log.info(

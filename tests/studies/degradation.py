@@ -24,6 +24,7 @@ from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 from tests.entry import command
+from tests.studies.results import write_csv
 from tests.studies.variants import seeds, variant
 
 __all__ = ["DegradationConfig", "action_gap", "main", "optimal_q"]
@@ -193,7 +194,7 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     rows = []
     for name in config.trained:
         rows += _watch(config, name)
-        files.write_csv(folder / "curves.csv", rows)  # whole variants, for a run that is stopped
+        write_csv(folder / "curves.csv", rows)  # whole variants, for a run that is stopped
     fitted = {name: _fit(config, name) for name in config.fitted}
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)

@@ -15,18 +15,26 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.cli import files
-from experiments.cli.choices import given
+from experiments.cli.files import given
 from experiments.reporting.tables import markdown
 
-__all__ = ["adopt", "differences", "leave", "main"]
+__all__ = ["adopt", "differences", "leave", "main", "write_csv"]
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows under the keys of the first one."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def leave(

@@ -233,11 +233,6 @@ class Estimator:
         return np.asarray(np.nansum(self._squares[:, -LAST:], axis=1))
 
     @property
-    def loud(self) -> NDArray[np.bool_]:
-        """Whether surprises are far larger than the filter believes, (N,); readings left out as outliers count."""
-        return self.loudness > LOUD
-
-    @property
     def quiet(self) -> NDArray[np.bool_]:
         """Whether they have long been far smaller, (N,)."""
         with np.errstate(invalid="ignore"):

@@ -141,7 +141,8 @@ class RelativeController:
             each.see(od, minute, rows)
         now = usable(od, rows)
         observation, sure = (np.stack(pair(setpoint), axis=1) for pair in (self.estimator.relative, self.estimator.sd))
-        q, alarm = self.policy.q_values(observation), self.estimator.loud | (self.estimator.quiet & ~self.second.quiet)
+        q, loud = self.policy.q_values(observation), self.estimator.loudness > filters.LOUD
+        alarm = loud | (self.estimator.quiet & ~self.second.quiet)
         supervised = alarm | self._outside(setpoint, observation)
         error, share = self.second.relative(setpoint)
         rate = np.where(supervised, np.clip(error + share, 0.0, 1.0), self.policy.actions[q.argmax(axis=1)])

@@ -69,45 +69,35 @@ class ShareEstimator(Remembers, Protocol):
     @property
     def begun(self) -> Mask:
         """Which cultures have been seen."""
-        ...
 
     def reset(self, n: int) -> None:
         """Forget everything; n cultures from here on."""
-        ...
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Watch a sample: OD, counts, degC, min since the run began; rows: True where it is new and used."""
-        ...
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL."""
-        ...
 
     def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
         """Shares counted in samples drawn at a minute since the run began; False where that is too long ago."""
-        ...
 
     @property
     def behind(self) -> bool:
         """Whether samples are still on their way into the estimate."""
-        ...
 
     @property
     def known(self) -> Array:
         """Up to which minute `retell` needs nothing of each culture; -inf where it needs all."""
-        ...
 
     def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
         """Minute, method and arguments of what was called in earlier lives of a run, in order, behind `known`."""
-        ...
 
     def estimate(self) -> Estimate:
         """Return the current estimate."""
-        ...
 
     def explain(self) -> dict[str, Array]:
         """Explain the estimate for recording and journal: ratio, ratio_low, ratio_high and more."""
-        ...
 
 
 class Acts(Protocol):
@@ -119,7 +109,6 @@ class Acts(Protocol):
         A law with a longer period of its own keeps its target until that is over. Args: minute: since the program
         began, (N,). rows: True where the estimate is new and a setpoint is in force; only these rows' state advances.
         """
-        ...
 
 
 class Law(Acts, Remembers, Protocol):
@@ -127,4 +116,3 @@ class Law(Acts, Remembers, Protocol):
 
     def reset(self, n: int) -> None:
         """Forget everything; n cultures from here on."""
-        ...

@@ -46,7 +46,6 @@ class Recall:
     """
 
     remembers = ("estimator", "earliest")
-    added = ("earliest",)
 
     def __init__(self, estimator: CompositionEstimator) -> None:
         self.estimator, self.earliest = estimator, copy.deepcopy(estimator)  # the latter: of the first chapter
