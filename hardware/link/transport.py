@@ -18,17 +18,8 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ProtocolError
 
 __all__ = [
-    "MAX_BODY",
-    "WEB_ADDRESS",
-    "Reply",
-    "SharedLink",
-    "SwitchedOff",
-    "Transport",
-    "TransportConfig",
-    "new_session",
-    "read_secret",
-    "switched_off",
-    "web_address",
+    "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
+    "read_secret", "switched_off", "web_address",
 ]  # fmt: skip
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
