@@ -234,10 +234,11 @@ class Pumps:
             or (self.lost(job) and self.box.state(job).at >= asked_s)
         ):  # fmt: skip
             now, state, taken = self.clock.now(), self.box.state(job), None
-            if now > asked_s + self.config.start_s and not (late or self.trouble or self.box.live(job)):
+            if now > asked_s + self.config.start_s and not (late or self.box.live(job)):
                 late = True
-                self.trouble = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
-                self.book.tell(self.trouble)
+                fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
+                self.trouble = self.trouble or fate
+                self.book.tell(fate)
             self.waits = self.waits or late
             if request.task and (answer := calls.ask("task", 0.5, self.web.result, request.task)):
                 taken = answer[0]

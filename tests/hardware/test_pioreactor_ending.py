@@ -75,6 +75,13 @@ def cut(lab: Lab) -> None:
     lab.world.cut()
 
 
+def cut_as_a_drain_begins(lab: Lab) -> None:
+    """The unit has heard of a portion of waste, and its pump has not begun."""
+    asked = len(lab.asked("remove_waste"))
+    lab.until(lambda: len(lab.asked("remove_waste")) > asked, 60.0)
+    lab.world.cut()
+
+
 def power(lab: Lab) -> None:
     lab.world.power()
 
@@ -102,6 +109,9 @@ WRONG = {
     "killed before it told its pin": Wrong(killed(0.01, mute=True), 70.0, unlock, "pwm_locks 13"),
     "killed before its unit knew": Wrong(UNKEPT, 70.0, unlock, "pwm_locks 13"),
     "killed before its unit knew, and rebooted": Wrong(UNKEPT, 70.0, both(cut, power), "pwm_locks 13"),
+    "killed, and rebooted as a drain begins": Wrong(
+        killed(0.2), 30.0, both(cut_as_a_drain_begins, power), "pwm_locks 13"
+    ),
     "killed, and rebooted": Wrong(killed(0.2), 40.0, both(cut, power), "pwm_locks 13"),
     "killed, queue dead": Wrong(
         both(killed(0.2), in_the_dose(world(queue=False))), 60.0, both(unlock, revive), "pwm_locks 13"
