@@ -33,7 +33,7 @@ def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_
     """Compute y - alpha (max_a Q_target(s, a) - Q_target(s, a_tm1)): advantage learning (Baird 1999).
 
     The fixed point has the same greedy policy and the same maximum V; its gaps V - Q(s, a) are 1 / (1 - alpha) times
-    those of Q-learning, so that an error of the network confuses fewer actions.
+    those of Q-learning, so that an error of the network confuses fewer actions (Bellemare 2016, eq. 10).
 
     Args: target: y, (S, B); q_tm1: target network at s, (S, B, A); a_tm1: (S, B) int64.
     Returns: shape (S, B).

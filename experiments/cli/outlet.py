@@ -1,4 +1,4 @@
-"""What goes out to whoever may not take it: it waits in a bounded queue for a thread of its own, nobody else waits."""
+"""Output that no caller waits for: a bounded queue, and a thread that writes it."""
 
 import atexit
 import logging
@@ -18,9 +18,9 @@ LAST_S, WAITING = 2.0, 2000  # for what is left at the end of a program; pieces 
 
 
 class Outlet(Generic[T]):
-    """A queue of at most `size` things, and a thread that sends them in turn. Putting one in never waits nor raises.
+    """A queue of at most `size` items, and a thread that sends them in order. `put` neither waits nor raises.
 
-    Attributes: dropped: how many found no room.
+    Attributes: dropped: number of items that found no room.
     """
 
     def __init__(self, send: Callable[[T], None], size: int) -> None:
@@ -30,7 +30,7 @@ class Outlet(Generic[T]):
         self._thread.start()
 
     def put(self, one: T) -> bool:
-        """Queue one; whether there was room."""
+        """Queue an item; return whether there was room."""
         if room := self._waiting.qsize() < self._size:
             self._waiting.put(one)
         self.dropped += not room
@@ -42,7 +42,7 @@ class Outlet(Generic[T]):
                 self._send(one)
 
     def close(self, within_s: float) -> int:
-        """Wait so long for what is queued, then give it up; how many were left."""
+        """Wait at most `within_s` for queued items, then drop them; return how many were dropped."""
         self._waiting.put(None)
         self._thread.join(within_s)
         self._over = self._thread.is_alive()
@@ -50,14 +50,14 @@ class Outlet(Generic[T]):
 
 
 class Screen:
-    """A standard stream whose reader nobody waits for; what is dropped is counted, and told once there is room."""
+    """A standard stream that never makes its writer wait; dropped lines are counted and reported later."""
 
     def __init__(self, stream: TextIO, size: int = WAITING) -> None:
         self._stream, self._number, self._lines = stream, stream.fileno(), 0
         self.outlet = Outlet(self._out, size)
 
     def write(self, text: str) -> int:
-        """Queue it."""
+        """Queue the text; return its length."""
         told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n"
         room = self.outlet.put((told * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
         self._lines = 0 if room else self._lines + text.count("\n")
@@ -68,19 +68,19 @@ class Screen:
             left = left[os.write(self._number, left) :]
 
     def close(self) -> None:
-        """Tell what is missing, and wait a little for all of it."""
+        """Report dropped lines, and wait at most `LAST_S` for queued output."""
         self.write("")
         self.outlet.close(LAST_S)
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Do nothing: no text is kept back."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
 def _may_wait(stream: TextIO) -> bool:
-    """Whether its reader can make a writer wait: a terminal, which Ctrl-S stops, a pipe or a socket."""
+    """Tell whether a reader can make the writer wait: a terminal (Ctrl-S), a pipe or a socket."""
     try:
         mode = os.fstat(stream.fileno()).st_mode
     except (AttributeError, OSError, ValueError):
@@ -89,7 +89,7 @@ def _may_wait(stream: TextIO) -> bool:
 
 
 def detach() -> None:
-    """From now on and until the program ends nobody waits for a reader of its screen. Idempotent."""
+    """Write standard output and error through threads from now on, so that no caller waits for a reader. Idempotent."""
     for name in ("stdout", "stderr"):
         before = getattr(sys, name)
         if not _may_wait(before):

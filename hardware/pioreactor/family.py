@@ -68,7 +68,7 @@ class PioreactorFamily(Family):
             return preflight(reactors)
 
     def no_thermostat(self, backend: PioreactorConfig) -> str | None:
-        """Return None: the vendor's thermostat may be left off."""
+        """Name the setting that leaves the vendor's thermostat off; None where the thermostat is on."""
         return None if backend.thermostat else " without backend.thermostat=true"
 
     def doses(self, backend: PioreactorConfig, bench: Bench) -> None:
