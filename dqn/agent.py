@@ -62,9 +62,9 @@ class DQNAgent:
         flat = np.stack([initial_weights(self.sizes, seed, config.init_zero_output) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
         basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
-        self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
-        self.target = self.online.with_weights(weights.clone())
-        self._adam = Adam(weights, self.online.grad)
+        self.network = QNetwork(weights, self.sizes, matrix, offset, basis)
+        self.target = self.network.with_weights(weights.clone())
+        self._adam = Adam(weights, self.network.grad)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2)
         self._draws = UniformStream(streams["replay"], config.batch_size)
@@ -97,12 +97,17 @@ class DQNAgent:
         greedy = u[:, 0] >= self.epsilon
         if greedy.any():
             seen = torch.from_numpy(observation).to(self.device).unsqueeze(1)
-            best = self.online(seen).argmax(-1).view(-1).cpu().numpy()
+            best = self.network(seen).argmax(-1).view(-1).cpu().numpy()
             action = np.where(greedy, best, action)
         return action
 
-    def observe(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
-        """Remember one step of every agent (arguments as `Replay.add`) and do the updates that are due."""
+    def observe(
+        self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array, ended: Array | None = None
+    ) -> None:
+        """Remember one step of every agent (arguments as `Replay.add`) and do the updates that are due.
+
+        Args: ended: not needed, a replayed transition stands alone.
+        """
         self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
         if self.steps > self.config.learn_start:
@@ -125,7 +130,7 @@ class DQNAgent:
             first = Transition(*(field[:, :, : self._relabelled] for field in batch))
             self._relabel.replace(first, self._goals.take(most))
             first.r_t.mul_(self.config.reward_scale)
-        features = self.online.features
+        features = self.network.features
         return batch._replace(s_tm1=features(batch.s_tm1), s_t=features(batch.s_t))
 
     def _q_target(self, features: torch.Tensor) -> torch.Tensor:
@@ -163,27 +168,37 @@ class DQNAgent:
         Args: features: of the observations, (S, B, F). action: (S, B) int64. target: (S, B).
         """
         c = self.config
-        q, inputs = self.online.forward(features)
+        q, inputs = self.network.forward(features)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
-        self.online.backward(inputs, gradient)
+        self.network.backward(inputs, gradient)
         self._adam.step(c.learning_rate_at(self.updates))
         self.updates += 1
         if self.updates % c.target_period == 0:
-            self.target.flat.copy_(self.online.flat)
+            self.target.flat.copy_(self.network.flat)
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
+    def curves(self) -> dict[str, NDArray[np.float64] | float]:
+        """Exploration rate, and loss and range of Q of the last update at which they were looked at."""
+        q_range = self.q_range.cpu().numpy().astype(np.float64)
+        return {
+            "train/loss": self.loss.cpu().numpy().astype(np.float64),
+            "train/epsilon": self.epsilon,
+            "q/min": q_range[:, 0],
+            "q/max": q_range[:, 1],
+        }
+
     def state_dict(self) -> dict[str, Any]:
         """Return the complete learning state. A new agent of the same config continues to the bit on one processor."""
-        tensors = {"online": self.online.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
+        tensors = {"online": self.network.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
         counts = {"steps": self.steps, "updates": self.updates}
         parts = {name: part.state_dict() for name, part in self._parts.items()}
         return {**{name: tensor.cpu() for name, tensor in tensors.items()}, **parts, **counts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
-        self.online.flat.copy_(state["online"])
+        self.network.flat.copy_(state["online"])
         self.target.flat.copy_(state["target"])
         for name, part in self._parts.items():
             part.load_state_dict(state[name])

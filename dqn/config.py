@@ -15,6 +15,7 @@ class DQNConfig:
     Raises: ValueError naming key, value and allowed range.
     """
 
+    kind: str = setting("dqn", "which algorithm")
     hidden: tuple[int, ...] = setting((64, 64), "of the ReLU layers", "units", at_least=1, some=True)
     gamma: float = setting(0.99, "discount per step", at_least=0.0, below=1.0)
     learning_rate: float = setting(1e-3, "Adam's", above=0.0, at_most=1.0)
@@ -82,11 +83,7 @@ class DQNConfig:
         part = max(0.0, 2.0 * update / max(1, self.total_updates) - 1.0)
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** part)
 
-    def updates_at(self, step: int) -> int:
-        """Gradient steps done when `step` environment steps have been taken."""
-        return max(0, step - self.learn_start) * self.updates_per_step
-
     @property
     def total_updates(self) -> int:
         """Gradient steps of a whole training run."""
-        return self.updates_at(self.total_steps)
+        return max(0, self.total_steps - self.learn_start) * self.updates_per_step

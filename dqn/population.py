@@ -60,11 +60,11 @@ class Population:
     @property
     def network(self) -> QNetwork:
         """Shape and constants of every agent's network, for `with_weights`; holds the first group's weights."""
-        return self.groups[0].agent.online
+        return self.groups[0].agent.network
 
     def weights(self) -> torch.Tensor:
         """Weights of all agents now, a copy, shape (S, P)."""
-        return torch.cat([group.agent.online.flat for group in self.groups])
+        return torch.cat([group.agent.network.flat for group in self.groups])
 
     def run(self) -> Iterator[TrainRecord]:
         """Train all groups to the end; one record, of all agents, per interval."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -10,9 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dqn.agent import DQNAgent
+from dqn.network import QNetwork
 
-__all__ = ["TrainRecord", "Trainer", "TrainingEnv"]
+__all__ = ["Agent", "TrainRecord", "Trainer", "TrainingEnv"]
+
+Array = NDArray[np.float64]
+Curves = Mapping[str, Array | float]
 
 Step = tuple[
     NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
@@ -35,28 +38,68 @@ class TrainingEnv(Protocol):
         """Restore it; returns the current observations."""
 
 
+class Agent(Protocol):
+    """S agents that learn side by side, each in its own copy of the environment; `DQNAgent` is one kind.
+
+    config: with `kind` and `total_steps`. network: of all agents; the action with its largest output is the greedy
+    policy, which is scored, kept and exported. steps: of the environment so far. updates: gradient steps so far.
+    """
+
+    config: Any
+    network: QNetwork
+    n_agents: int
+    steps: int
+    updates: int
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Choose actions to learn from, (S, O) -> (S,)."""
+
+    def observe(
+        self,
+        s_tm1: NDArray[np.float32],
+        a_tm1: NDArray[np.int64],
+        r_t: Array,
+        s_t: NDArray[np.float32],
+        continues: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
+    ) -> None:
+        """Count one step of every agent and learn from it.
+
+        Args: s_tm1, s_t: before and after it, (S, O). continues: there is a future to value, (S,). ended: the next step
+          begins another episode, (S,); both hold where an episode was cut off at its last step.
+        """
+
+    def curves(self) -> Curves:
+        """Return what to log, by tag: one number per agent, (S,), or one for all."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return tensors and plain values, with which a new agent of the same config continues to the bit."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved."""
+
+
 @dataclass(frozen=True)
 class TrainRecord:
     """What happened in one interval of training; arrays have one entry per agent, shape (S,).
 
     episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
-    loss, q_min, q_max: of the last update at which they were looked at, at most 100 updates ago.
+    curves: of `Agent.curves`, by tag.
     """
 
     step: int
     updates: int
-    epsilon: float
-    episode_return: NDArray[np.float64]
-    loss: NDArray[np.float64]
-    q_min: NDArray[np.float64]
-    q_max: NDArray[np.float64]
+    episode_return: Array
+    curves: Curves
 
     @classmethod
     def joined(cls, records: Sequence[TrainRecord]) -> TrainRecord:
         """One record of the agents of several, taken at the same step."""
-        each = ("episode_return", "loss", "q_min", "q_max")
-        whole: dict[str, Any] = {key: np.concatenate([getattr(r, key) for r in records]) for key in each}
-        return replace(records[0], **whole)
+        curves = {
+            tag: np.concatenate([np.asarray(r.curves[tag]) for r in records]) if np.ndim(first) else first
+            for tag, first in records[0].curves.items()
+        }
+        return replace(records[0], episode_return=np.concatenate([r.episode_return for r in records]), curves=curves)
 
 
 class Trainer:
@@ -65,7 +108,7 @@ class Trainer:
     Args: env: one copy per agent. agent: the S agents. interval: steps between records.
     """
 
-    def __init__(self, env: TrainingEnv, agent: DQNAgent, interval: int) -> None:
+    def __init__(self, env: TrainingEnv, agent: Agent, interval: int) -> None:
         self.env = env
         self.agent = agent
         self.interval = interval
@@ -101,7 +144,7 @@ class Trainer:
         ended = done.any()
         # at the end of an episode the environment already shows the start of the next one
         reached = np.where(done[:, None], infos["final_obs"], self._observation) if ended else self._observation
-        agent.observe(before, action, reward, reached, ~terminated)
+        agent.observe(before, action, reward, reached, ~terminated, done)
         self._return += reward
         if ended:
             self._finished[done] = self._return[done]
@@ -109,11 +152,7 @@ class Trainer:
 
     def _record(self) -> TrainRecord:
         agent = self.agent
-        q_range = agent.q_range.cpu().numpy().astype(np.float64)
-        return TrainRecord(
-            step=agent.steps, updates=agent.updates, epsilon=agent.epsilon, episode_return=self._finished.copy(),
-            loss=agent.loss.cpu().numpy().astype(np.float64), q_min=q_range[:, 0], q_max=q_range[:, 1],
-        )  # fmt: skip
+        return TrainRecord(agent.steps, agent.updates, self._finished.copy(), agent.curves())
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state of agents, environment and loop."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from experiments.cli import frame
-from experiments.training.config import TrainConfig, env_schema
+from experiments.training.config import TrainConfig, agent_schema, env_schema
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -16,8 +16,9 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 
 def _schema(cfg: DictConfig) -> TrainConfig:
-    """Use for each environment the config of its kind."""
-    return TrainConfig(env=env_schema(str(cfg.env.get("kind", "density"))))
+    """Use for environment and agent the config of its kind."""
+    env, agent = cfg.env.get("kind", "density"), cfg.agent.get("kind", "dqn")
+    return TrainConfig(env=env_schema(str(env)), agent=agent_schema(str(agent)))
 
 
 main = frame.Command("train", TrainConfig(), train, _schema, resumes="checkpoint.pt", goes_on=True)

@@ -16,7 +16,9 @@ from tests.programs import ROOT
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?:python|yaml)\n([\s\S]*?)```")
 FILES = {name: text for name, text in NAMED.findall(PAGE)}
-WHOLE = {"light.py": (ROOT / "tests" / "extensions" / "light.py").read_text(encoding="utf-8")}  # named by the page
+WHOLE = {  # named by the page
+    name: (ROOT / "tests" / "extensions" / name).read_text(encoding="utf-8") for name in ("light.py", "ppo.py")
+}
 COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
 SHORT = {
     "experiments.benchmark": ["replicates=1"],
@@ -45,11 +47,11 @@ def summary(folder: Path) -> dict[str, object]:
 def test_the_page_names_every_file_it_shows() -> None:
     names = "steps.yaml", "gentle.py", "patient.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py"
     assert set(FILES) == set(names)
-    assert len(COMMANDS) == 10
+    assert len(COMMANDS) == 12
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [c for c in COMMANDS if "sb3" not in c and "policy.npz" not in c])
+@pytest.mark.parametrize("command", [c for c in COMMANDS if not re.search("sb3|ppo|policy", c)])
 def test_a_command_of_the_page_works(command: str, folder: Path) -> None:
     words = shlex.split(command)[2:]
     done = run([*words, *SHORT.get(words[0], [])], folder)
@@ -75,6 +77,47 @@ assert (policies.load(Path("policy.npz")).act(seen) == theirs).mean() > 0.995
         done = run(words, folder)
         assert done.returncode == 0, done.stderr
     assert summary(folder)["reactors"]
+
+
+@pytest.mark.slow
+def test_an_agent_of_ones_own_trains_and_its_policy_pumps(folder: Path) -> None:
+    train, deploy = (shlex.split(c)[2:] for c in COMMANDS if re.search("ppo|policy=latest", c))
+    done = run([*train, "agent.total_steps=430", "agent.horizon=70", "hydra.run.dir=runs/train/here"], folder)
+    assert done.returncode == 0, done.stderr
+    found = summary(folder)
+    assert (found["env_steps"], found["updates"]) == (430, 6 * 10)
+    assert "train/critic_loss" in (folder / "runs/train/here/progress.csv").read_text(encoding="utf-8")
+    again = run([*deploy, "scenario=./steps.yaml", "hydra.run.dir=there"], folder)
+    assert again.returncode == 0, again.stderr
+    assert json.loads((folder / "there" / "summary.json").read_text(encoding="utf-8"))["reactors"]
+
+
+def test_an_agent_of_ones_own_continues_to_the_bit_from_amid_a_horizon(folder: Path) -> None:
+    """Of two groups; the first record of the second life is that of the first one, and so is every weight."""
+    check = """
+import runpy
+from pathlib import Path
+import numpy as np, torch
+from dqn import checkpoint
+from envs.task import EnvConfig
+from experiments.training import build, tasks
+build.GROUP, task = 2, tasks.of(EnvConfig(episode_steps=30))
+agent = runpy.run_path("ppo.py")["PpoConfig"](total_steps=130, horizon=41)
+whole, again = (build.population(task, agent, (3, 4, 9)) for _ in range(2))
+start, records = whole.weights(), []
+for record in whole.run():
+    records.append(record)
+    if record.step == 90:
+        checkpoint.save(Path("at.pt"), whole.state_dict())
+again.load_state_dict(checkpoint.load(Path("at.pt")))
+for one, other in zip(records[3:], again.run(), strict=True):
+    assert one.step == other.step
+    np.testing.assert_array_equal(one.episode_return, other.episode_return)
+    np.testing.assert_array_equal(one.curves["train/critic_loss"], other.curves["train/critic_loss"])
+assert torch.equal(whole.weights(), again.weights()) and not (start == whole.weights()).all(1).any()
+"""
+    done = run(["-c", check], folder)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_controller_of_ones_own_decides(folder: Path) -> None:

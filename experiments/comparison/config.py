@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from conf.schema import check, part, require, setting
-from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
@@ -40,7 +39,7 @@ class BenchmarkConfig:
         0, "of plants, noise, training and calibration; every controller meets the same draws", at_least=0
     )
     env: EnvConfig = part(EnvConfig, "what model-based controllers believe, and agents are trained on")
-    agents: dict[str, DQNConfig] = setting({}, "learned controllers by name")
+    agents: dict[str, Any] = setting({}, "learned controllers by name")
     train_seeds: int = setting(
         4, "seeds an agent is trained with; the best policy on the selection grid controls", within=(1, 1000)
     )

@@ -1,15 +1,15 @@
 """From an agent's config to agents in their environments, and from weights to the policies they stand for."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
-from dqn.agent import STREAMS, DQNAgent
-from dqn.config import DQNConfig
 from dqn.network import QNetwork
 from dqn.population import GROUP, Population
 from dqn.trainer import Trainer
+from experiments.training import agents
 from experiments.training.evaluation import Act
 from experiments.training.tasks import Task
 
@@ -27,7 +27,7 @@ def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.ran
 
 
 def population(
-    task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
+    task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
 ) -> Population:
     """Agents with the given seeds in groups of a size that suits the device; arguments as `Population`."""
     size = GROUP if device == "cpu" else len(seeds)
@@ -35,11 +35,10 @@ def population(
     return Population([trainer(task, agent, group, device) for group in groups], threads)
 
 
-def trainer(task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
+def trainer(task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu") -> Trainer:
     """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
-    own = streams(seeds, (*STREAMS, "env"))
-    learner = DQNAgent(agent, len(task.observation), task.actions.size, own, task.hindsight(agent), device)
-    return Trainer(task.copies(own["env"]), learner, interval=task.episode_steps)
+    own = streams(seeds, (*agents.names(agent), "env"))
+    return Trainer(task.copies(own["env"]), agents.build(agent, task, own, device), interval=task.episode_steps)
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:

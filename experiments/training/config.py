@@ -9,8 +9,7 @@ from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 
-__all__ = ["ENVS", "TrainConfig", "env_schema"]
-
+__all__ = ["AGENTS", "ENVS", "TrainConfig", "agent_schema", "env_schema"]
 
 ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
 
@@ -22,12 +21,22 @@ def env_schema(kind: str) -> Any:
     return ENVS[kind]()
 
 
+AGENTS: dict[str, type[Any]] = {"dqn": DQNConfig}
+
+
+def agent_schema(kind: str) -> Any:
+    """Return the default config of an agent of this kind. Raises: ValueError naming the kinds there are."""
+    if kind not in AGENTS:
+        raise ValueError(f"agent.kind = {kind}: allowed {', '.join(AGENTS)}")
+    return AGENTS[kind]()
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
 
     env: Any = part(EnvConfig, "the training model and its episodes")
-    agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
+    agent: Any = part(DQNConfig, "the agent's hyper-parameters")
     pair: str | None = setting(
         None,
         "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",

@@ -19,7 +19,7 @@ from experiments.cli import files, frame
 from experiments.cli.calibrated import read_curves, read_env_file, read_pair
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
-from experiments.training import announcements, tasks
+from experiments.training import announcements
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
@@ -50,10 +50,10 @@ def train(config: TrainConfig, folder: Path) -> float:
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
     if isinstance(config.env, EnvConfig):
         _warn_of_growth(config.env)
-    _check_inputs(config)
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
-        session = Session(config, folder, resume=config.resume is not None)
+        with frame.refusing(ValueError):
+            session = Session(config, folder, resume=config.resume is not None)
     except CheckpointError as error:
         raise frame.UserError(f"resume={config.resume}: {error}") from None
     try:
@@ -62,26 +62,6 @@ def train(config: TrainConfig, folder: Path) -> float:
     finally:
         session.writer.close()
     return float(session.best.merit.max())
-
-
-def _check_inputs(config: TrainConfig) -> None:
-    """Refuse an agent that never learns, or whose inputs are made for observations of another width.
-
-    Raises: UserError.
-    """
-    agent, names = config.agent, tasks.of(config.env).observation
-    if agent.learn_start >= agent.total_steps:
-        raise frame.UserError(
-            f"agent.learn_start = {agent.learn_start}: allowed 0 to {agent.total_steps - 1}, below agent.total_steps; "
-            "nothing is learned before"
-        )
-    width = np.size(agent.input_matrix) // len(agent.input_offset) if agent.input_offset else len(names)
-    if width != len(names):
-        raise frame.UserError(
-            f"agent.input_matrix has rows of {width} numbers, this task observes {len(names)} ({', '.join(names)}): "
-            "choose the agent of the task, e.g. agent=coculture for env=coculture, agent=coculture_preview for "
-            "env=coculture_preview, agent=relative for env=relative, or agent=paper"
-        )
 
 
 def _warn_of_growth(env: EnvConfig) -> None:
@@ -153,7 +133,7 @@ def _export(session: Session, score: Score) -> tuple[Path, Policy]:
             "agent": asdict(c.agent),
             "config_hash": fingerprint(c),
             "trained_steps": int(best.step[i]),
-            "updates": c.agent.updates_at(int(best.step[i])),
+            "updates": int(best.updates[i]),
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }

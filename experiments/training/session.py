@@ -29,7 +29,7 @@ __all__ = ["Best", "Session", "merit"]
 log = logging.getLogger(__name__)
 
 LINES = 20  # of progress where there is no terminal
-PER_AGENT = ("merit", "regret", "steady", "step")  # arrays of `Best`, (S,)
+PER_AGENT = ("merit", "regret", "steady", "step", "updates")  # arrays of `Best`, (S,)
 
 
 def merit(score: Score, task: Task) -> NDArray[np.float64]:
@@ -50,6 +50,7 @@ class Best:
     regret: NDArray[np.float64]  # per cent, of the best by merit, (S,)
     steady: NDArray[np.float64]  # OD, likewise
     step: NDArray[np.int64]  # (S,)
+    updates: NDArray[np.int64]  # gradient steps until then, (S,)
     history: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
     """Step, regret_pct and steady_abs_error of every evaluation, per agent."""
 
@@ -58,9 +59,10 @@ class Best:
         """Nothing scored yet; `weights` (S, P) stand until something is."""
         n = weights.shape[0]
         worst = np.full((3, n), np.inf)
-        return cls(weights.cpu().clone(), worst[0], worst[1], worst[2], np.zeros(n, dtype=np.int64))
+        step, updates = np.zeros((2, n), dtype=np.int64)
+        return cls(weights.cpu().clone(), worst[0], worst[1], worst[2], step, updates)
 
-    def update(self, step: int, score: Score, value: NDArray[np.float64], weights: torch.Tensor) -> None:
+    def update(self, step: int, updates: int, score: Score, value: NDArray[np.float64], weights: torch.Tensor) -> None:
         """Keep what has a lower merit `value`, (S,), than before."""
         self.history.append((step, score.regret_pct.tolist(), score.steady_abs_error.tolist()))
         better = value < self.merit
@@ -69,7 +71,7 @@ class Best:
         self.merit[better] = value[better]
         self.regret[better] = score.regret_pct[better]
         self.steady[better] = score.steady_abs_error[better]
-        self.step[better] = step
+        self.step[better], self.updates[better] = step, updates
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state, tensors and plain values."""
@@ -115,7 +117,7 @@ class Session:
         """Score the greedy policies on the selection grid, keep the best, log."""
         weights = self.agents.weights()
         score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
-        self.best.update(step, score, merit(score, self.task), weights)
+        self.best.update(step, self.agents.updates, score, merit(score, self.task), weights)
         kept = {"kept/regret_pct": self.best.regret, "kept/steady_abs_error": self.best.steady}
         now = {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
         self.writer.scalars(step, now | kept)
@@ -142,7 +144,7 @@ class Session:
     def _news(self, record: TrainRecord) -> str:
         """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""
         if not record.updates and record.step < self.config.agent.total_steps:
-            return f"untrained until step {self.config.agent.learn_start}"
+            return "untrained: no update yet"
         score, kept = self.evaluate(record.step), (self.best.regret, self.best.steady)
         return announcements.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
@@ -161,10 +163,7 @@ class Session:
             record.step,
             {
                 "train/return": record.episode_return,
-                "train/loss": record.loss,
-                "train/epsilon": record.epsilon,
-                "q/min": record.q_min,
-                "q/max": record.q_max,
+                **record.curves,
                 "speed/steps_per_s": record.step * len(self.seeds) / max(self.seconds, 1e-9),
             },
         )

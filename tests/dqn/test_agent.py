@@ -60,7 +60,7 @@ def test_one_update_agrees_with_torch() -> None:
     """Minibatch, target, squared error and Adam's step, recomputed with autograd from the same draws."""
     config = DQNConfig(**{**SMALL.__dict__, "learn_start": 40, "total_steps": 41, "gamma": 0.9})
     trainer = _trainer(config, range(2))
-    before = trainer.agent.online.flat.clone()
+    before = trainer.agent.network.flat.clone()
     _train(trainer)
     agent = trainer.agent
     assert agent.updates == 1
@@ -88,7 +88,7 @@ def test_one_update_agrees_with_torch() -> None:
         slope = parameters.grad
         assert slope is not None
         expected = before[i] - config.learning_rate * slope / (slope.abs() + 1e-8)  # Adam's first step
-        torch.testing.assert_close(agent.online.flat[i].double(), expected, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(agent.network.flat[i].double(), expected, rtol=1e-4, atol=1e-6)
 
 
 def _filled(config: DQNConfig, seeds: range) -> DQNAgent:
@@ -137,11 +137,11 @@ def test_the_target_network_is_copied_when_it_is_due_and_stays_in_between() -> N
     """Period 4: the target network is that of updates 0, 4, 8, 12 until the next of them."""
     agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "target_period": 4}), 3, 3, streams(range(2)))
     draws = torch.Generator().manual_seed(0)
-    history = [agent.online.flat.clone()]
+    history = [agent.network.flat.clone()]
     for update in range(1, 14):
         observation = torch.rand(2, 8, 3, generator=draws)
         agent.fit(observation, torch.randint(3, (2, 8), generator=draws), torch.rand(2, 8, generator=draws))
-        history.append(agent.online.flat.clone())
+        history.append(agent.network.flat.clone())
         assert not torch.equal(history[-1], history[-2])
         assert torch.equal(agent.target.flat, history[[0, 4, 8, 12][update // 4]])
 
@@ -161,7 +161,7 @@ def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() ->
     here, paid = np.tile(np.array([1.0, 0.0], dtype=np.float32), (2, 1)), np.ones(2)
     for k in range(400):
         agent.observe(here, np.full(2, k % 2), paid, here, paid)
-    q = agent.online(torch.eye(2).expand(2, 2, 2))
+    q = agent.network(torch.eye(2).expand(2, 2, 2))
     torch.testing.assert_close(q[:, 0], torch.full((2, 2), 10.0), rtol=0.02, atol=0.0)
     torch.testing.assert_close(q[:, 1], torch.full((2, 2), -20.0), rtol=0.02, atol=0.0)
 
@@ -171,7 +171,7 @@ def test_exploration_follows_epsilon_and_tries_every_action_equally_often() -> N
     config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.6, "epsilon_end": 0.6})
     agent = DQNAgent(config, 3, 5, streams(range(64)))
     observation = torch.eye(3)[torch.arange(64) % 3]
-    greedy = agent.online(observation.unsqueeze(1))[:, 0].argmax(-1).numpy()
+    greedy = agent.network(observation.unsqueeze(1))[:, 0].argmax(-1).numpy()
     beyond = (np.array([agent.act(observation.numpy()) for _ in range(400)]) - greedy) % 5
     np.testing.assert_allclose(np.bincount(beyond.ravel(), minlength=5) / beyond.size, [0.52, *[0.12] * 4], atol=0.01)
 
@@ -204,9 +204,9 @@ def test_the_last_updates_are_taken_at_the_rate_that_the_config_ends_with() -> N
     config = DQNConfig(**{**SMALL.__dict__, "learning_rate_end": 3e-5})
     for update, rate in ((0, 3e-3), (config.total_updates, 3e-5)):
         agent = DQNAgent(config, 3, 3, streams(range(2)))
-        agent.updates, before = update, agent.online.flat.clone()
+        agent.updates, before = update, agent.network.flat.clone()
         agent.fit(torch.ones(2, 4, 3), torch.zeros(2, 4, dtype=torch.int64), torch.full((2, 4), 9.0))
-        assert float((agent.online.flat - before).abs().max()) == pytest.approx(rate, rel=0.01)
+        assert float((agent.network.flat - before).abs().max()) == pytest.approx(rate, rel=0.01)
 
 
 def test_costs_are_learned_in_the_scale_of_their_root_and_gaps_are_widened_there(

@@ -27,9 +27,10 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     one, many = _population(1), _population(3)
     for a, b in zip(one.run(), many.run(), strict=True):
         assert a.step == b.step
-        for key in ("episode_return", "loss", "q_min", "q_max"):
-            assert getattr(a, key).shape == (8,)
-            np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+        assert a.episode_return.shape == a.curves["train/loss"].shape == (8,)
+        np.testing.assert_array_equal(a.episode_return, b.episode_return)
+        for tag, values in a.curves.items():
+            np.testing.assert_array_equal(values, b.curves[tag])
     assert (many.n_agents, many.steps, many.updates) == (8, SMALL.total_steps, SMALL.total_updates)
     assert torch.equal(one.weights(), many.weights())
 
@@ -40,7 +41,7 @@ def test_agents_come_in_the_order_of_their_groups() -> None:
     for _ in population.run():
         pass
     weights = population.weights()
-    assert torch.equal(weights[5], population.groups[1].agent.online.flat[1])
+    assert torch.equal(weights[5], population.groups[1].agent.network.flat[1])
     alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
     first = next(alone.run())
     np.testing.assert_allclose(next(_population(2).run()).episode_return[5], first.episode_return[0])
@@ -63,7 +64,7 @@ def test_no_running_mean_stays_too_small_for_the_processor() -> None:
     """Units that are never on have gradient 0, and 0.9^k of an earlier one falls below 1e-38 within 900 updates."""
     config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "hidden": (8,), "learning_rate": 0.05})
     agent = DQNAgent(config, 3, 3, streams(range(4)))
-    agent.online.flat[:, 24:28] = -10.0  # biases of the first four units
+    agent.network.flat[:, 24:28] = -10.0  # biases of the first four units
     earlier = agent.state_dict()
     earlier["adam"]["mean"].fill_(1e-3)
     agent.load_state_dict(earlier)

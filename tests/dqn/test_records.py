@@ -35,12 +35,12 @@ def test_records_come_at_their_steps_and_at_the_end_and_tell_of_the_last_whole_e
     records = list(trainer.run())
     assert [r.step for r in records] == [30, 60, 90, 120, 130]
     assert [r.updates for r in records] == [20, 80, 140, 200, 220]  # two from step 21 on
-    assert [r.epsilon for r in records] == pytest.approx([0.715, 0.43, 0.145, 0.05, 0.05])
+    assert [r.curves["train/epsilon"] for r in records] == pytest.approx([0.715, 0.43, 0.145, 0.05, 0.05])
     paid = np.array(env.paid)
     episodes = [paid[start : start + 40].sum(axis=0) for start in (0, 40, 80)]
     expected = [[np.nan] * 2, *episodes, [np.nan] * 2]
     np.testing.assert_array_equal([r.episode_return for r in records], expected)
-    assert [bool((r.q_max > r.q_min).any()) for r in records] == [False, False, True, True, True]
+    assert [bool(np.any(r.curves["q/max"] > r.curves["q/min"])) for r in records] == [False, False, True, True, True]
     assert list(trainer.run()) == []
 
 
@@ -51,7 +51,7 @@ def test_loss_and_range_of_q_are_looked_at_every_hundredth_update() -> None:
         observation = torch.randn(2, 4, 3, generator=generator)
         action = torch.randint(0, 3, (2, 4), generator=generator)
         target = torch.randn(2, 4, generator=generator)
-        q = agent.online(observation).clone()
+        q = agent.network(observation).clone()
         agent.fit(observation, action, target)
         if k < DIAGNOSED:
             assert not agent.loss.any()
@@ -66,13 +66,11 @@ def test_loss_and_range_of_q_are_looked_at_every_hundredth_update() -> None:
 
 def test_records_of_several_trainers_are_joined_in_order() -> None:
     one, other = (
-        TrainRecord(7, 5, 0.5, *(np.array([10.0 * k + j]) for j in range(4)))  # type: ignore[arg-type]
-        for k in (1, 2)
+        TrainRecord(7, 5, np.array([10.0 * k]), {"loss": np.array([10.0 * k + 1]), "epsilon": 0.5}) for k in (1, 2)
     )
     joined = TrainRecord.joined([one, other])
-    assert (joined.step, joined.updates, joined.epsilon) == (7, 5, 0.5)
-    fields = (joined.episode_return, joined.loss, joined.q_min, joined.q_max)
-    assert [list(field) for field in fields] == [[10.0 + j, 20.0 + j] for j in range(4)]
+    assert (joined.step, joined.updates, joined.curves["epsilon"]) == (7, 5, 0.5)
+    assert [list(field) for field in (joined.episode_return, joined.curves["loss"])] == [[10.0, 20.0], [11.0, 21.0]]
 
 
 @pytest.mark.parametrize(("total", "start", "each", "updates"), [(100, 30, 2, 140), (20, 30, 2, 0), (31, 30, 1, 1)])
@@ -103,8 +101,8 @@ def test_the_target_of_an_update_with_and_without_an_action_gap(gap: float, monk
     maps = {"input_matrix": (1.0, -1.0, 0.0, 2.0), "input_offset": (0.5, 0.0)}
     config = DQNConfig(hidden=(8,), batch_size=4, gamma=0.9, action_gap=gap, reward_scale=2.0, **maps)
     agent = DQNAgent(config, 2, 3, streams(range(2)))
-    np.testing.assert_array_equal(agent.online.input_map()[0], [[1.0, -1.0], [0.0, 2.0]])
-    np.testing.assert_array_equal(agent.online.input_map()[1], [0.5, 0.0])
+    np.testing.assert_array_equal(agent.network.input_map()[0], [[1.0, -1.0], [0.0, 2.0]])
+    np.testing.assert_array_equal(agent.network.input_map()[1], [0.5, 0.0])
     assert agent.sizes == (2, 8, 3)
     before, after, action = np.full((2, 2), 0.3), np.full((2, 2), 0.7), np.array([1, 2])
     agent.observe(before, action, np.array([0.25, -0.5]), after, np.array([1.0, 0.0]))

@@ -66,9 +66,9 @@ def test_torch_keeps_no_graph_while_it_trains_and_goes_on_when_it_is_used_afterw
     trainer = Trainer(env, DQNAgent(config, 1, 2, streams(range(2))), interval=15)
     assert [record.step for record in trainer.run()] == [15, 30, 40]
     assert not env.kept
-    before = trainer.agent.online.flat.clone()
+    before = trainer.agent.network.flat.clone()
     trainer.agent.learn()
-    assert not torch.equal(before, trainer.agent.online.flat)
+    assert not torch.equal(before, trainer.agent.network.flat)
     trainer.agent.load_state_dict(trainer.agent.state_dict())
 
 

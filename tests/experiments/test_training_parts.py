@@ -27,7 +27,7 @@ from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.train import main as entry_point
-from experiments.training import announcements, build
+from experiments.training import announcements, build, tasks
 from experiments.training import run as train_run
 from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
@@ -102,7 +102,7 @@ def test_what_is_kept_is_told_of_the_policy_that_is_kept() -> None:
         scored([4.0, 8.0], [[0.0, 0.0], [0.0, 0.0]]),
     ]
     for k, score in enumerate(each, 1):
-        best.update(100 * k, score, merit(score, task), torch.full((2, 3), float(k)))
+        best.update(100 * k, 7 * k, score, merit(score, task), torch.full((2, 3), float(k)))
     assert best.merit == pytest.approx([2.0 / 3.0, 1.0])
     assert best.steady.tolist() == [0.002, 0.003]
     assert best.regret.tolist() == [0.3, 0.2]
@@ -192,7 +192,7 @@ def test_the_summary_names_the_seed_of_the_policy_that_flies_and_has_of_each_wha
     monkeypatch.setattr(train_run, "_figures", Mock())
     one = session(tmp_path / "run", **THREE)
     one.best.weights[:] = torch.stack([aiming(gain) for gain in (71.3, 19.7, 5.9)])
-    one.agents.groups[0].agent.online.flat[:] = torch.stack([aiming(gain) for gain in (3.1, 41.7, 9.3)])
+    one.agents.groups[0].agent.network.flat[:] = torch.stack([aiming(gain) for gain in (3.1, 41.7, 9.3)])
     one.best.merit[:], one.best.step[:] = [3.0, 0.9, 2.0], [80, 60, 100]
     train_run._finish(one)
     one.writer.close()
@@ -235,7 +235,7 @@ def population(env: str, agent: str, seeds: Iterable[int], interval: int, thread
     words = ["env.episode_steps=24", "agent.learn_start=70", "agent.total_steps=130"]
     words += ["agent.replay_size=60", "agent.target_period=31", "agent.batch_size=16"]
     config = entry_point.config([f"env={env}", f"agent={agent}", *words])
-    made = build.population(train_run.tasks.of(config.env), config.agent, tuple(seeds), threads=threads)
+    made = build.population(tasks.of(config.env), config.agent, tuple(seeds), threads=threads)
     for group in made.groups:
         group.interval = interval
     return made
@@ -385,10 +385,10 @@ def test_curves_show_speed_of_all_agents_limits_and_what_is_kept(tmp_path: Path)
     one = session(tmp_path / "run", n_agents=3)
     one.writer.close()
     one.writer, one.seconds = Mock(), 8.0
-    record = Mock(step=120, episode_return=np.array([-1.0, -2.0, -3.0]))
+    record = Mock(step=120, episode_return=np.array([-1.0, -2.0, -3.0]), curves={"train/mine": 0.5})
     one._log(record)
     step, values = one.writer.scalars.call_args.args
-    assert (step, values["speed/steps_per_s"]) == (120, 3 * 120 / 8.0)
+    assert (step, values["speed/steps_per_s"], values["train/mine"]) == (120, 3 * 120 / 8.0, 0.5)
     assert values["train/return"].tolist() == one.returns[-1] == [-1.0, -2.0, -3.0]
     one.best.merit[0] = 0.0  # of the first agent nothing better comes
     one.best.regret[0], one.best.steady[0] = 0.2, 0.001
@@ -507,7 +507,7 @@ def test_more_agents_than_a_group_holds_are_the_seeds_that_they_are_called_by() 
     many = build.population(task, SMALL, range(5, 23), threads=3)
     assert ([group.agent.n_agents for group in many.groups], many.n_agents, many.threads) == ([16, 2], 18, 3)
     for k in (0, 15, 16, 17):
-        alone = build.trainer(task, SMALL, [5 + k]).agent.online.flat[0]
+        alone = build.trainer(task, SMALL, [5 + k]).agent.network.flat[0]
         assert torch.equal(many.weights()[k], alone)
     assert [group.interval for group in many.groups] == [EnvConfig().episode_steps] * 2
 
@@ -660,10 +660,10 @@ def test_the_hash_of_a_policy_is_of_model_and_agent_and_of_nothing_else() -> Non
 @pytest.mark.parametrize("env", [EnvConfig(), RelativeConfig(largest_error=1.5)], ids=["density", "relative"])
 def test_a_policy_of_estimates_says_with_which_estimator_it_was_meant(env: Any, tmp_path: Path) -> None:
     config = TrainConfig(agent=SMALL, env=env, n_agents=2, seed=3)
-    task = train_run.tasks.of(env)
+    task = tasks.of(env)
     agents = build.population(task, SMALL, (3, 4))
     best = Best.empty(agents.weights())
-    best.merit[:], best.step[:] = (2.0, 1.0), (90, 60)
+    best.merit[:], best.step[:], best.updates[:] = (2.0, 1.0), (90, 60), (50, 20)
     parts = SimpleNamespace(config=config, best=best, task=task, folder=tmp_path, seeds=(3, 4), agents=agents)
     path, flies = train_run._export(parts, scored([0.3, 0.6], [[0.01, 0.02], [0.001, 0.003]]))  # type: ignore[arg-type]
     said = policy.load(path).metadata

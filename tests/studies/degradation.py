@@ -106,8 +106,8 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
                 "regret_pct_worst": float(score.regret_pct.max()),
                 "steady_abs_error": float(np.median(score.steady_abs_error)),
                 "value_error": float(np.median(np.sqrt(np.mean(error**2, axis=-1)))),
-                "lowest_value": float(np.median(record.q_min)) / agent.reward_scale,
-                "td_error": float(np.median(np.sqrt(2.0 * record.loss))) / agent.reward_scale
+                "lowest_value": float(np.median(record.curves["q/min"])) / agent.reward_scale,
+                "td_error": float(np.median(np.sqrt(2.0 * record.curves["train/loss"]))) / agent.reward_scale
                 if not agent.huber
                 else np.nan,
             }
@@ -155,10 +155,10 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
         batch = Transition(pair[0], torch.from_numpy(action), torch.empty(shape), pair[1], zero)
         relabel.replace(batch, relabel.drawn(torch.from_numpy(np.stack([u[2], u[3]], -1))))
         target = _exact(unit, od, batch.s_t[..., 1].double().numpy(), action, agent.action_gap)
-        features = learner.online.features(batch.s_tm1)
+        features = learner.network.features(batch.s_tm1)
         learner.fit(features, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
     report = Evaluation(task, task.report_grid())
-    score = report(build.act_with(learner.online, learner.online.flat), config.n_agents)
+    score = report(build.act_with(learner.network, learner.network.flat), config.n_agents)
     log.info("%s, fitted to Q*: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max())
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}
 
