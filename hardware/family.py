@@ -7,7 +7,7 @@ import logging
 import math
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -21,6 +21,7 @@ from envs.bench import Bench
 from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
+from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.clock import run_time
 from hardware.errors import DeviceStateError, ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
@@ -59,12 +60,13 @@ def report(checks: Sequence[Check]) -> None:
 class Can:
     """What the reactors of a family can do.
 
-    fluorescence: measure it, by which a share is known. spare_pumps: give by pumps 3 and 4. thermostat: hold the
-    temperature that a step asks for. regulation: hold an OD by themselves. resume: go on after the program was killed.
+    fluorescence: measure it, by which a share is known. spare_pumps: numbers of those that give a fluid of their own.
+    thermostat: hold the temperature that a step asks for. regulation: hold an OD by themselves. resume: go on after the
+    program was killed.
     """
 
     fluorescence: bool = False
-    spare_pumps: bool = False
+    spare_pumps: tuple[int, ...] = ()
     thermostat: bool = False
     regulation: bool = False
     resume: bool = False
@@ -171,8 +173,7 @@ class Family:
         if "regulate" in ends and not (self.can.regulation or self.simulated):
             raise UnfitError(f"at_end = regulate: {where} has no regulation of its own; allowed hold, stop")
         self.doses(backend, bench)
-        if any(s.supplied for s in scenarios):
-            self._gives(backend, bench, scenarios)
+        self.gives(backend, bench, [s.supplied for s in scenarios], "scenario.outputs")
 
     def no_thermostat(self, backend: Any) -> str | None:
         """None if the temperature is controlled; else what is missing for that, behind "controls none"."""
@@ -181,21 +182,34 @@ class Family:
     def doses(self, backend: Any, bench: Bench) -> None:
         """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
 
-    def _gives(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario]) -> None:
-        """Whether doses of spare pumps may be large enough, and there are such pumps. Raises: UnfitError."""
+    def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
+        """Whether spare pumps can give doses, and these are large enough.
+
+        Args: pumps: numbers of those that each reactor is fed by. who: asks for that, a key.
+        Raises: UnfitError.
+        """
+        if not any(pumps):
+            return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
         if most_ml < needed:
-            remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more beside scenario.outputs"
+            remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more beside {who}"
             raise UnfitError(f"bench.max_rate = {bench.max_rate:g} mL/s: {remedy}")
         if bench.control_min > MADE_UP_MIN:
-            remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s beside scenario.outputs"
+            remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s beside {who}"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {remedy}")
-        if not self.can.spare_pumps:
-            raise UnfitError(f"scenario.outputs: backend={backend.kind} has no spare pumps; drop them")
-        self.tubes(backend, scenarios, most_ml)
+        for name, asked in zip(backend.reactors, pumps, strict=True):
+            for number in sorted(asked):
+                if number not in self.can.spare_pumps:
+                    raise UnfitError(f"{who}: backend={backend.kind} has no pump {number} to spare; drop it")
+                self.tube(backend, number, most_ml, f"{who} of {name}")
 
-    def tubes(self, backend: Any, scenarios: Sequence[Scenario], most_ml: float) -> None:
-        """Whether each spare pump that a scenario gives by has a tube, and can give `most_ml`. Raises: UnfitError."""
+    def tube(self, backend: Any, number: int, most_ml: float, who: str) -> None:
+        """Whether a spare pump has a tube, and can give `most_ml`. Raises: UnfitError, naming who asks for it."""
+
+    def actuators(self, backend: Any) -> tuple[Actuator, ...]:
+        """List what signals of the control loop may command."""
+        heat = (THERMOSTAT,) if self.no_thermostat(backend) is None else ()
+        return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
     def coculture(self, backend: Any, pair: str) -> Any:
         """Put vials of two species into a config that simulates vials that were left as they are. pair: which."""

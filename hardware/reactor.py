@@ -5,7 +5,7 @@ sample), decide for the rows that are `fresh`, `actuate` those rows. `stop` is i
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -86,12 +86,14 @@ class Command:
     pump_rate: mean feed rate over the coming control period, mL/s, shape (N,), >= 0.
     temperature: thermostat target, degC, shape (N,); nan leaves it as it is.
     pump: number of the pump that gives the dose, 1 (the feed), 3 or 4, shape (N,); None: the feed everywhere.
+    targets: of actuators of a family's own, by name, each (N,); nan leaves one as it is.
     """
 
     rows: Mask
     pump_rate: Array
     temperature: Array
     pump: NDArray[np.intp] | None = None
+    targets: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

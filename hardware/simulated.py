@@ -122,7 +122,7 @@ class SimulatedFamily(Family):
     """Vials in this process."""
 
     config = SimulatedConfig
-    can = Can(fluorescence=True, spare_pumps=True, thermostat=True)
+    can = Can(fluorescence=True, spare_pumps=(3, 4), thermostat=True)
     called = "simulated vials"
     at_stake = False
     simulated = True

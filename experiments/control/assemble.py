@@ -280,13 +280,21 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
     """Build the signals held beside the density. Raises: UserError where scenario, backend and they do not fit."""
-    with frame.refusing(ValueError):
+    with frame.refusing(ValueError, ReactorError):
         share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
         own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
         vials = family_of(config.backend).vials(config.backend, plant)
         lit = family_of(config.backend).sees_fluorescence(config.backend) or (vials and vials[1].second.present)
         light = [Light()] if lit and not share and not own else []
-        return signals.one_each([*share, *light, *own])
+        family, made = family_of(config.backend), [*share, *light, *own]
+        actuators = {actuator.name: actuator for actuator in family.actuators(config.backend)}
+        signals.fitting(made, list(actuators.values()))
+        for signal in made:
+            pump, key = actuators[signal.actuator].pump if signal.actuator else 0, f"signals.{signal.name}"
+            if pump and any(pump in s.supplied for s in scenarios):
+                raise frame.UserError(f"{key}: pump {pump} is in scenario.outputs, too; allowed one of them")
+            family.gives(config.backend, config.bench, [{pump} - {0}] * len(scenarios), key)
+        return made
 
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
@@ -350,7 +358,10 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
             signal.truth = partial(getattr, plant.culture, "share")
     counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
     scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
-    loop = ClosedLoop(reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale)
+    loop = ClosedLoop(
+        reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale,
+        setup.family.actuators(setup.backend),
+    )  # fmt: skip
     if plant is not None:
         loop.density.known(plant, flow, setup.bench)
     if setup.resumed:

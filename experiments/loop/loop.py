@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from envs.scenario import Scenario
 from experiments.laws.base import Array, Controller, Mask
 from experiments.loop.progress import Progress
-from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, one_each
+from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, fitting
 from experiments.loop.supply import Supply
 from hardware import memory
+from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.memory import Remembers
 from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import RAW_MAX, Response
@@ -24,6 +25,7 @@ from hardware.safety.interlock import Interlock, Verdict
 __all__ = ["ClosedLoop", "Step"]
 
 WRONG = "{key}: {value}, expected a list of {what}"
+OURS = (THERMOSTAT, *SPARE.values())  # the others reach the reactors by their names
 OWN = memory.Words("{value}, expected keys and values", WRONG, WRONG, "{key} is for {k} reactors, this run has {n}")
 
 
@@ -83,9 +85,10 @@ class ClosedLoop:
         setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
       before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
       scale: of each culture over that of the law's model, as of `Density`.
-      further: signals beside the density; what acts by the thermostat decides on the temperature in place of the
-        schedules wherever it gives a target.
-    Raises: ValueError for another number of schedules than of reactors, or two signals with one actuator.
+      further: signals beside the density; each commands its actuator, in place of the schedules wherever it decides.
+      actuators: what the reactors have.
+    Raises: ValueError for another number of schedules than of reactors, two signals with one actuator, or one whose
+      actuator the reactors do not have.
     """
 
     remembers = ("began", "done", "stopped")
@@ -100,11 +103,14 @@ class ClosedLoop:
         at_end: Sequence[str] | str = "stop",
         further: Sequence[Signal] = (),
         scale: Array | float = 1.0,
+        actuators: Sequence[Actuator] = (FEED, THERMOSTAT),
     ) -> None:
         n = len(reactors.names)
         self.reactors, self.interlock = reactors, interlock
         self.density = Density(controller, scale, interlock.bench.max_rate)
-        self.signals = one_each([self.density, *further])
+        self.signals = fitting([self.density, *further], actuators)
+        by_name = {actuator.name: actuator for actuator in actuators}
+        self._commanded = [(signal, by_name[signal.actuator]) for signal in further if signal.actuator]
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
@@ -113,7 +119,8 @@ class ClosedLoop:
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
         self.progress = Progress(self.schedules)
-        self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s)
+        asked = [actuator.pump for _, actuator in self._commanded if actuator.pump]
+        self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s, asked)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
@@ -148,9 +155,14 @@ class ClosedLoop:
 
         sample = Sample.of(m, self.interlock, rows, believed, elapsed, phase, setpoint, temperature)
         decided = self.density.decide(sample)
-        for signal in self.signals[1:]:
-            allowed = self.interlock.temperature(signal.decide(sample))
-            temperature = np.where(np.isfinite(allowed), allowed, temperature)
+        commands: dict[str, Array] = {}
+        for signal, actuator in self._commanded:
+            command = self.interlock.command(actuator, signal.decide(sample))
+            if actuator == THERMOSTAT:
+                command = temperature = np.where(np.isfinite(command), command, temperature)
+            elif actuator.pump:
+                self.supply.ask(actuator.pump, command)
+            commands[actuator.name] = command
         steered = believed & (phase >= 0)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
@@ -163,7 +175,7 @@ class ClosedLoop:
         explanation: dict[str, Array] = {}
         reasons: Sequence[str | None] = verdict.reasons
         for signal in self.signals:
-            found = signal.find(sample, verdict.rate if signal is self.density else temperature)
+            found = signal.find(sample, commands.get(signal.actuator, verdict.rate))
             columns, explanation = columns | dict(found.columns), explanation | dict(found.why)
             if found.warnings:
                 reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]
@@ -181,9 +193,10 @@ class ClosedLoop:
         self.gone = absent & (verdict.response == Response.STOP)
         failures = self._respond(verdict, left)
         heat = np.where(verdict.heat_off, np.nan, temperature)
-        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat, pump))
+        own = {actuator.name: commands[actuator.name] for _, actuator in self._commanded if actuator not in OURS}
+        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat, pump, own))
         self.supply.given(pump, receipt.volume_ml)
-        self.book(receipt, now)
+        self.book(receipt, now, pump)
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
@@ -191,16 +204,17 @@ class ClosedLoop:
     def _book_repeats(self) -> None:
         """Book what the devices dosed by themselves at its own time, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
-            self.book(receipt, at_s)
-            self.supply.given(np.full(len(self.done), receipt.pump), receipt.volume_ml)
+            pump = np.full(len(self.done), receipt.pump or FEED.pump)
+            self.book(receipt, at_s, pump)
+            self.supply.given(pump, receipt.volume_ml)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
-    def book(self, receipt: Receipt, at_s: float) -> None:
-        """Book a dose with the interlock and every signal. Args: at_s: run time, s."""
+    def book(self, receipt: Receipt, at_s: float, pump: NDArray[np.intp]) -> None:
+        """Book a dose with the interlock and every signal. Args: at_s: run time, s. pump: which gave it, (N,)."""
         self.interlock.confirm(receipt, at_s)
         kept_ml = np.zeros(len(self.done)) if receipt.kept_ml is None else receipt.kept_ml
         for signal in self.signals:
-            signal.dosed(receipt.volume_ml, kept_ml)
+            signal.dosed(receipt.volume_ml, kept_ml, pump)
 
     def set_level(self, name: str, level_ml: float) -> float:
         """Set the ledger of a vial, and the device's own, to a level that was read; return the old level, mL."""

@@ -6,13 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.coculture.task import logit
 from envs.scenario import Scenario
 from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
 from experiments.laws.share.program import Program
-from experiments.loop.signals import THERMOSTAT, Answer, Count, Findings, Sample, Span
+from experiments.loop.signals import Answer, Count, Findings, Sample, Span
+from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
 __all__ = ["COLUMNS", "TRUE", "Light", "Share", "ShareWarnings", "program_of"]
@@ -58,7 +60,7 @@ def program_of(schedule: Scenario) -> Program:
 class Light:
     """The fluorescence of reactors whose share nobody holds: recorded, and nothing done about it."""
 
-    name, actuator, columns, memory = "fluorescence", "nothing", COLUMNS[:1], None
+    name, actuator, columns, memory = "fluorescence", "", COLUMNS[:1], None
 
     def decide(self, sample: Sample) -> Array:
         """See `Signal.decide`: it asks for no temperature."""
@@ -69,7 +71,7 @@ class Light:
         light = sample.measured.fluorescence
         return Findings({"fluorescence": np.full(sample.rows.shape, np.nan) if light is None else light})
 
-    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+    def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`."""
 
 
@@ -94,7 +96,7 @@ class Share:
       simulated: the recording has the true share, which `truth` gives.
     """
 
-    name, actuator = "composition", THERMOSTAT
+    name, actuator = "composition", THERMOSTAT.name
     remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(
@@ -232,6 +234,6 @@ class Share:
         """See `Signal.memory`."""
         return self
 
-    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+    def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`; what was put off comes later."""
         self.estimator.dosed(volume_ml)

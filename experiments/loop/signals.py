@@ -16,15 +16,14 @@ from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
+from hardware.actuator import FEED, Actuator
 from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
 __all__ = [
     "ESTIMATED",
-    "FEED",
     "FILTER_ALARM",
-    "THERMOSTAT",
     "TRUE",
     "Counted",
     "Density",
@@ -32,12 +31,11 @@ __all__ = [
     "Sample",
     "Signal",
     "add",
+    "fitting",
     "made",
-    "one_each",
     "within_2sd",
 ]
 
-FEED, THERMOSTAT = "feed pump", "thermostat"
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
 FILTER_ALARM = "filter_alarm"  # in a row; on the screen the supervisor's beginning and end are said
@@ -94,8 +92,9 @@ class Findings:
 class Signal(Protocol):
     """A quantity that is held, structurally.
 
-    name: under which its state is saved. actuator: what acts on it. columns: that it adds to a recording, behind those
-    of signals before it. Of a column NAME and one NAME_setpoint the summary gives the errors of every window.
+    name: under which its state is saved. actuator: name of what acts on it, "" for nothing. columns: that it adds to a
+    recording, behind those of signals before it. Of a column NAME and one NAME_setpoint the summary gives the errors of
+    every window.
     """
 
     @property
@@ -108,16 +107,19 @@ class Signal(Protocol):
     def columns(self) -> tuple[str, ...]: ...
 
     def decide(self, sample: Sample) -> Array:
-        """Watch a sample and decide, (N,): mL/s of the feed pump, or the thermostat's target, degC.
+        """Watch a sample and decide on a command, (N,), in the unit of the actuator: mL/s, degC.
 
-        A target is cut to the interlock's limits; one that is nan leaves the schedule's.
+        It is cut to the actuator's limits; one that is nan leaves the schedule's, and means 0 to a pump.
         """
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """Report on the sample. Args: given: the command to the actuator, in the unit of `decide`, (N,)."""
+        """Report on the sample. Args: given: the command to the actuator as cut, in the unit of `decide`, (N,)."""
 
-    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
-        """Fresh medium that went in since this was last called, and what was put off to the next dose, mL, (N,)."""
+    def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
+        """Take what went in since this was last called, and what was put off to the next dose, mL, (N,).
+
+        Args: pump: number of the pump that gave it, 1 for the feed, (N,).
+        """
 
     @property
     def memory(self) -> Remembers | None:
@@ -155,7 +157,7 @@ class Density:
       max_rate: largest rate, mL/s.
     """
 
-    name, actuator = "controller", FEED
+    name, actuator = "controller", FEED.name
     columns: tuple[str, ...] = ()  # the recording has them in any case
 
     def __init__(self, law: Controller, scale: Array | float = 1.0, max_rate: float = math.inf) -> None:
@@ -194,7 +196,7 @@ class Density:
         said = "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
         return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())
 
-    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+    def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`."""
         if isinstance(self.law, Accounts):
             self.law.dosed((volume_ml + kept_ml) / self._scale)
@@ -237,10 +239,16 @@ def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
     return MAKERS[name](config, schedules)
 
 
-def one_each(signals: Sequence[Signal]) -> list[Signal]:
-    """Check that no two signals share an actuator; return them. Raises: ValueError naming both."""
+def fitting(signals: Sequence[Signal], actuators: Sequence[Actuator]) -> list[Signal]:
+    """Check that each signal acts by something that the reactors have, and no two by the same; return them.
+
+    Raises: ValueError naming the signals, and what there is.
+    """
+    known = [actuator.name for actuator in actuators]
     for k, signal in enumerate(signals):
+        if signal.actuator and signal.actuator not in known:
+            raise ValueError(f"{signal.name} acts by the {signal.actuator}: these reactors have {', '.join(known)}")
         for other in signals[:k]:
-            if signal.actuator == other.actuator:
+            if signal.actuator and signal.actuator == other.actuator:
                 raise ValueError(f"{other.name} and {signal.name} act by the same {signal.actuator}: allowed one")
     return list(signals)

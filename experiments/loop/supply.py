@@ -1,11 +1,11 @@
-"""Who gives the next dose: the feed pump as the controller decides, or a spare pump to which the step owes a dose.
+"""Who gives the next dose: the feed pump as the controller decides, or a spare pump that owes one.
 
 There is one dose per sample, whichever pump gives it, so two pumps never feed at one time, and a spare pump's dose
 passes the interlock, its ledger and the waste pump's law like any other. The controller's dose of that sample is left
 out; it makes up for it at the next ones, because it sees the OD.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +20,16 @@ FEED_PUMP = 1
 
 
 class Supply:
-    """What N reactors' steps owe by pumps 3 and 4.
+    """What pumps 3 and 4 owe N reactors: by the steps of their schedules, or by what a signal asks.
 
-    owed grows by the step's mL/h, and by its mL once at the step's first sample; it is given in doses of `DOSE_ML` to
-    `most_ml`, equal parts where it takes several. What a step still owes at its end is left out.
+    owed grows by the mL/h of the step or the signal, and by the step's mL once at its first sample; it is given in
+    doses of `DOSE_ML` to `most_ml`, equal parts where it takes several. What a step still owes at its end is left out.
 
-    Args: schedules: one per reactor. most_ml: largest dose.
-    Attributes: any, whether any step has outputs; owed_ml, mL, (N, 2); remembers, nothing where there are none.
+    Args: schedules: one per reactor. most_ml: largest dose. asked: pumps that a signal commands.
+    Attributes: any, whether anything is ever owed; owed_ml, mL, (N, 2); remembers, nothing where nothing is.
     """
 
-    def __init__(self, schedules: Sequence[Scenario], most_ml: float) -> None:
+    def __init__(self, schedules: Sequence[Scenario], most_ml: float, asked: Collection[int] = ()) -> None:
         n, width = len(schedules), max(len(s.setpoints) for s in schedules)
         self._per_min, self._once = np.zeros((n, width, len(PUMPS))), np.zeros((n, width, len(PUMPS)))
         for i, schedule in enumerate(schedules):
@@ -37,11 +37,17 @@ class Supply:
                 for output in outputs_of(text):
                     at = (i, k, PUMPS.index(output.pump))
                     self._per_min[at], self._once[at] = output.ml_h / 60.0, output.ml
-        self.any = bool((self._per_min + self._once).any())
+        scheduled = (self._per_min + self._once).any(axis=(0, 1))
+        self._asked = np.isin(PUMPS, list(asked))
+        self.any = bool((scheduled | self._asked).any())
         self.remembers = ("owed_ml", "supplied_at", "supplied_step") if self.any else ()
         self._most_ml = most_ml
         self.owed_ml = np.zeros((n, len(PUMPS)))
         self._supplied_at, self._supplied_step = np.full(n, np.nan), np.full(n, -1)
+
+    def ask(self, pump: int, rate: Array) -> None:
+        """Take a signal's command from now on. Args: rate: mean rate, mL/s, (N,); nan is 0."""
+        self._per_min[:, :, PUMPS.index(pump)] = 60.0 * np.nan_to_num(rate)[:, None]
 
     def due(self, elapsed: Array, phase: NDArray[np.intp], rows: Mask) -> tuple[NDArray[np.intp], Array]:
         """Which pump each reactor is to be fed by, 1, 3 or 4, and the dose of a spare pump, mL, each (N,).
@@ -54,7 +60,8 @@ class Supply:
         row, step = np.arange(n), np.maximum(phase, 0)
         passed = np.clip(np.nan_to_num(elapsed - self._supplied_at), 0.0, MADE_UP_MIN)
         new = phase != self._supplied_step
-        owed = np.where(new[:, None], self._once[row, step], self.owed_ml + self._per_min[row, step] * passed[:, None])
+        owed = self.owed_ml + self._per_min[row, step] * passed[:, None]
+        owed = np.where(new[:, None] & ~self._asked, self._once[row, step], owed)
         self.owed_ml = np.where(rows[:, None], owed, self.owed_ml)
         self._supplied_at = np.where(rows, elapsed, self._supplied_at)
         self._supplied_step = np.where(rows, phase, self._supplied_step)

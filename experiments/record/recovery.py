@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.loop.loop import ClosedLoop, Step
+from hardware.actuator import FEED
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
@@ -265,15 +266,16 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         if dose is None:
             break
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
-        loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
+        pump = np.where(mine, dose.pump or FEED.pump, FEED.pump)
+        loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s, pump)
         if dose.n > decided.get(dose.reactor, -1):  # what came before the newest decision is in its position already
-            loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
+            loop.supply.given(pump, mine * dose.feed_ml)
         if dose.again and dose.n > written.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
     before = [row for row in journal.rows if row["n"] < state["journal_row"]]
     kept_ml = _put_off(journal.rows, loop) - _put_off(before, loop)
     for signal in loop.signals:
-        signal.dosed(np.zeros(kept_ml.size), kept_ml)
+        signal.dosed(np.zeros(kept_ml.size), kept_ml, np.full(kept_ml.size, FEED.pump))
     names = list(loop.reactors.names)
     shares = [row for row in journal.rows if row["kind"] == "share" and row["reactor"] in names]
     counted = [(names.index(s["reactor"]), float(s["share"]), float(s["sd"]), float(s["minute"])) for s in shares]

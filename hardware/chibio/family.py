@@ -1,12 +1,11 @@
 """Chi.Bio reactors as a family: the link to the device, its preflight, its calibrations, its spare pumps."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from envs.bench import VIAL_ML, Bench
-from envs.scenario import Scenario
 from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import identity
@@ -47,7 +46,7 @@ class ChiBioFamily(Family):
     """One device with up to eight reactors."""
 
     config = ChiBioConfig
-    can = Can(fluorescence=True, spare_pumps=True, thermostat=True, regulation=True, resume=True)
+    can = Can(fluorescence=True, spare_pumps=(3, 4), thermostat=True, regulation=True, resume=True)
     called = "the Chi.Bio"
 
     def linked(self, backend: ChiBioConfig, bench: Bench) -> AbstractContextManager[Link]:
@@ -78,20 +77,15 @@ class ChiBioFamily(Family):
         with self.linked(backend, bench) as (transport, clock):
             return preflight(transport, clock, backend, calibrations, folder, bench)
 
-    def tubes(self, backend: ChiBioConfig, scenarios: Sequence[Scenario], most_ml: float) -> None:
+    def tube(self, backend: ChiBioConfig, number: int, most_ml: float, who: str) -> None:
         """By `backend.supply`. Raises: UnfitError."""
-        for name, scenario in zip(backend.reactors, scenarios, strict=True):
-            for number in sorted(scenario.supplied):
-                key = f"backend.supply.pump{number}_ml_s"
-                if f"Pump{number}" not in backend.supply.pumps:
-                    remedy = (
-                        f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
-                    )
-                    raise UnfitError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
-                can = backend.supply.most_ml(f"Pump{number}")
-                if can < most_ml - 1e-9:
-                    remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller bench.max_rate"
-                    raise UnfitError(f"{key}: Pump{number} gives at most {can:.2f} mL a dose: {remedy}")
+        key, pump = f"backend.supply.pump{number}_ml_s", f"Pump{number}"
+        if pump not in backend.supply.pumps:
+            remedy = f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
+            raise UnfitError(f"{who}: {pump} has no tube; {remedy}")
+        if (can := backend.supply.most_ml(pump)) < most_ml - 1e-9:
+            remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller bench.max_rate"
+            raise UnfitError(f"{key}: {pump} gives at most {can:.2f} mL a dose: {remedy}")
 
     def doses(self, backend: ChiBioConfig, bench: Bench) -> None:
         """Whether the period is the device's, and the vials hold the cultures. Raises: UnfitError."""

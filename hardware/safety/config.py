@@ -56,7 +56,7 @@ REMEDIES = {
     "device": "see the text",
     "fluorescence": "check LED, spectrometer and the slot's gain",
     "fluorescence_lost": "composition is not seen: check LED and spectrometer, then look at the device's FP slot",
-    "temperature_limit": "nothing if the law asked for too much; else set safety.composition_low and composition_high",
+    "command_limit": "nothing if the law asked for too much; else set safety.composition_low and composition_high",
 }
 RESPONSES = {
     "setpoint": "hold",  # outside (0, MAX_SETPOINT]
@@ -81,7 +81,7 @@ RESPONSES = {
     "thermometer": "report",  # reads nonsense; the heater is switched off
     "fluorescence": "report",  # none, none at all, full scale or frozen
     "fluorescence_lost": "report",  # and for more than light_lost minutes
-    "temperature_limit": "report",  # a composition's temperature was out of range: cut
+    "command_limit": "report",  # what a signal asked of an actuator was out of range: cut
     # kinds of `reactor.Fault`
     "link": "hold",  # no answer
     "selection": "hold",  # the device addresses another reactor

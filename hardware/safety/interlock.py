@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from envs.bench import Bench
 from hardware import memory
+from hardware.actuator import THERMOSTAT, Actuator
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, MAX_SETPOINT, REMEDIES, Response, SafetyConfig
@@ -80,7 +81,7 @@ class Interlock:
         self._heat = Heat(n, self.config)
         self._light = Light(n, self.config)
         self._parts = (self.budget, self._readings, self._change, self._heat, self._light)
-        self._asked_c = np.full(n, math.nan)  # temperatures out of range, until `check` has told of them
+        self._cut: dict[str, Finding] = {}  # commands out of range, until `check` has told of them
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)  # a `Response` that no later one may fall below
@@ -108,7 +109,8 @@ class Interlock:
         allowed, of_rates = self.budget.check(rate, fresh, now)
         found = self._reported(measurement)
         of_light = self._light.check(measurement, now)
-        findings = [*of_readings, *of_changes, *of_heat, of_setpoint, *of_rates, *of_light, self._cut()]
+        findings = [*of_readings, *of_changes, *of_heat, of_setpoint, *of_rates, *of_light, *self._cut.values()]
+        self._cut = {}
         self._collect(found, findings, now)
         self._add_holds(found, fresh, now)
         return self._conclude(found, allowed, np.where(sound, np.clip(setpoint, 0.05, None), 0.5))
@@ -130,21 +132,25 @@ class Interlock:
         """
         return self._light.believed(measurement)
 
-    def temperature(self, target: Array) -> Array:
-        """Cut a composition controller's target to the limits, degC, shape (N,); nan stays.
+    def command(self, actuator: Actuator, asked: Array) -> Array:
+        """Cut what a signal asks of an actuator to its limits, in its unit, shape (N,); nan stays.
 
         The next `check` tells of what was cut.
         """
-        c = self.config
-        allowed = np.clip(np.asarray(target, dtype=np.float64), c.composition_low, c.composition_high)
-        self._asked_c = np.where(allowed == target, math.nan, target)  # nan is none
+        low, high = actuator.low, actuator.high
+        if actuator.pump:
+            low, high = 0.0, self.bench.max_rate
+        elif actuator == THERMOSTAT:
+            low, high = self.config.composition_low, self.config.composition_high
+        asked = np.asarray(asked, dtype=np.float64)
+        allowed = np.clip(asked, low, high)
+        limits = f"allowed {low:g} to {high:g}"
+        self._cut[actuator.name] = Finding(
+            "command_limit",
+            ~np.isnan(asked) & (allowed != asked),
+            lambda i: f"{actuator.name}: {asked[i]:.4g} {actuator.unit} asked, {limits}",
+        )
         return np.asarray(allowed)
-
-    def _cut(self) -> Finding:
-        """Report what `temperature` cut since the last call."""
-        asked, self._asked_c = self._asked_c, np.full(self.n, math.nan)
-        limits = f"{self.config.composition_low:g} to {self.config.composition_high:g}"
-        return Finding("temperature_limit", ~np.isnan(asked), lambda i: f"{asked[i]:.1f} degC asked, allowed {limits}")
 
     def _reported(self, m: Measurement) -> list[list[_Reason]]:
         """Collect the faults that the reactors report themselves."""

@@ -19,6 +19,7 @@ from experiments.loop.share import COLUMNS, Share, ShareWarnings
 from experiments.loop.signals import Sample, Signal
 from experiments.record.record import Table
 from experiments.record.summary import composition_figure_of, figure_of
+from hardware.actuator import THERMOSTAT
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
 from hardware.safety.config import SafetyConfig
@@ -80,7 +81,7 @@ def step(
     interlock = Interlock(n, SafetyConfig(**safety))
     phase, od, degc = np.zeros(n, dtype=np.intp), np.full(n, 0.5), np.full(n, 33.2)
     sample = Sample.of(m, interlock, fresh, np.full(n, believed), since, phase, od, degc)
-    allowed = interlock.temperature(composition.decide(sample))
+    allowed = interlock.command(THERMOSTAT, composition.decide(sample))
     target = np.where(np.isfinite(allowed), allowed, degc)
     found = composition.find(sample, target)
     return Composed(target, found.columns, found.warnings)

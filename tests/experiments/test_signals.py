@@ -20,6 +20,7 @@ from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
+from hardware.actuator import THERMOSTAT
 from hardware.emulator.device import plant_preset
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -118,6 +119,6 @@ def test_names_and_actuators_are_used_once() -> None:
         signals.add("interlock", light.Light)
     held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
     with pytest.raises(ValueError, match="light and light act by the same thermostat"):
-        signals.one_each(held)
+        signals.fitting(held, [THERMOSTAT])
     with pytest.raises(ValueError, match=r"signals\.dark: .*allowed .*light"):
         signals.made("dark", None, [SCHEDULE])

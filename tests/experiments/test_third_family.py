@@ -76,7 +76,7 @@ def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_
     ("given", "refusal"),
     [
         (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence, by which"),
-        (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no spare pumps; drop them"),
+        (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no pump [34] to spare; drop it"),
         (["at_end=regulate"], "at_end = regulate: backend=evolver has no regulation of its own; allowed hold, stop"),
         (["controller=oracle"], "oracle: knows a simulated plant; allowed with backend=sim only, not backend=evolver"),
         (["backend.reactors=[a,b]"], "backend.reactors = .*: allowed 16 different names"),

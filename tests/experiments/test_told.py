@@ -64,7 +64,7 @@ def test_a_dose_is_told_by_what_it_is_of_the_bench_s_vial() -> None:
     """.7 mL into 14 mL dilute as 1 mL into 20; what a tube kept counts as well."""
     told: list[Any] = []
     law: Any = SimpleNamespace(dosed=lambda ml: told.append(ml.tolist()), restore=None)
-    Density(law, np.array([0.7, 1.0])).dosed(np.array([0.7, 0.7]), np.array([0.14, 0.2]))
+    Density(law, np.array([0.7, 1.0])).dosed(np.array([0.7, 0.7]), np.array([0.14, 0.2]), np.array([1, 1]))
     assert told == [pytest.approx([1.2, 0.9])]
 
 

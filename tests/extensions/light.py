@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.scenario import Scenario
 from experiments.laws import registry
 from experiments.laws.base import Array, Mask
 from experiments.loop import signals
-from experiments.loop.signals import THERMOSTAT, Findings, Sample
+from experiments.loop.signals import Findings, Sample
+from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
 
@@ -50,7 +52,7 @@ class Integral:
 class Light:
     """The light, averaged over some readings. See `Signal`."""
 
-    name, actuator, columns = "light", THERMOSTAT, ("light", "light_setpoint")
+    name, actuator, columns = "light", THERMOSTAT.name, ("light", "light_setpoint")
     remembers = ("law", "mean")
 
     def __init__(self, config: IntegralConfig, schedules: Sequence[Scenario]) -> None:
@@ -71,7 +73,7 @@ class Light:
         said = [f"light_far: {self._mean[n]:.0f} counts; reported; wait" if far[n] else None for n in range(far.size)]
         return Findings({"light": self._mean, "light_setpoint": setpoint}, {"thermostat_degc": given}, said)
 
-    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+    def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         pass
 
     @property

@@ -119,7 +119,7 @@ def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_i
 
 
 def test_every_declared_reason_is_tried() -> None:
-    elsewhere = {"no_dilution", "cannot_hold", "fluorescence", "fluorescence_lost", "temperature_limit"}
+    elsewhere = {"no_dilution", "cannot_hold", "fluorescence", "fluorescence_lost", "command_limit"}
     assert set(TRIGGERS) | set(OF_DEVICES) | elsewhere == set(RESPONSES)
 
 

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from hardware.actuator import THERMOSTAT
 from hardware.reactor import Measurement
 from hardware.safety.config import Response, Responses, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict
@@ -109,16 +110,16 @@ def test_a_resumed_run_remembers_repeats_and_silence() -> None:
 def test_a_temperature_is_cut_to_the_limits_and_that_is_said_once() -> None:
     bench = Bench(5)
     asked = np.array([20.0, 29.0, 33.2, 37.5, NAN])
-    np.testing.assert_array_equal(bench.interlock.temperature(asked), [29.0, 29.0, 33.2, 36.0, NAN])
+    np.testing.assert_array_equal(bench.interlock.command(THERMOSTAT, asked), [29.0, 29.0, 33.2, 36.0, NAN])
     _, verdict = bench.step(*[1500.0] * 5)
-    cut = ("temperature_limit",)
+    cut = ("command_limit",)
     assert verdict.kinds == (cut, (), (), cut, ())
-    assert "37.5 degC asked, allowed 29 to 36" in str(verdict.reasons[3])
+    assert "thermostat: 37.5 degC asked, allowed 29 to 36" in str(verdict.reasons[3])
     assert bench.step(*[1600.0] * 5)[1].kinds == ((),) * 5
 
 
 def test_limits_of_the_temperature_are_settings() -> None:
     interlock = Interlock(2, SafetyConfig(composition_low=30.0, composition_high=34.0))
-    np.testing.assert_array_equal(interlock.temperature(np.array([-np.inf, np.inf])), [30.0, 34.0])
+    np.testing.assert_array_equal(interlock.command(THERMOSTAT, np.array([-np.inf, np.inf])), [30.0, 34.0])
     with pytest.raises(ValueError, match=r"safety\.composition_high = 30\.0: allowed 31 to 42"):
         SafetyConfig(composition_low=31.0, composition_high=30.0)
