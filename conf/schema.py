@@ -22,11 +22,15 @@ ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # 
 TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
 
 
+Kinds = Callable[[str, str], Any]
+
+
 @dataclass(frozen=True)
 class Meaning:
     """What a field is and which values it takes. Bounds of a tuple hold for each of its entries.
 
-    interval: a pair [low, high], rising. some: a tuple that may not be empty.
+    interval: a pair [low, high], rising. some: a tuple that may not be empty. kinds: of a part, or of parts by name,
+    the default config of each `kind`, called with kind ("": not said) and key; raises ValueError naming what there is.
     """
 
     what: str
@@ -39,6 +43,7 @@ class Meaning:
     interval: bool = False
     some: bool = False
     note: str = ""
+    kinds: Kinds | None = None
 
     def holds(self, given: Any) -> bool:
         """Whether a value is in range; nan is in none."""
@@ -122,9 +127,9 @@ def setting(default: T, what: str, unit: str = "", within: tuple[float, float] |
     return field(default=default, metadata=said)
 
 
-def part(factory: Callable[[], T], what: str) -> T:
-    """Declare a field that holds a config dataclass of its own."""
-    return field(default_factory=factory, metadata={"meaning": Meaning(what)})
+def part(factory: Callable[[], T], what: str, kinds: Kinds | None = None) -> T:
+    """Declare a field that holds a config dataclass of its own; kinds: as of `Meaning`."""
+    return field(default_factory=factory, metadata={"meaning": Meaning(what, kinds=kinds)})
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
@@ -213,6 +218,10 @@ def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> 
             return None
         hint = next(h for h in get_args(hint) if h is not types.NoneType)
     origin, inner = get_origin(hint) or hint, get_args(hint)
+    if said.kinds is not None and origin is not dict and given is not None:
+        require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.kind=NAME")
+        if default is None or "kind" in given:
+            default = said.kinds(str(given.get("kind", "")), key)
     holds_part = is_dataclass(default) or is_dataclass(hint)
     if holds_part or origin is dict:
         require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")

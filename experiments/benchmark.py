@@ -2,12 +2,8 @@
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig
-from experiments.laws import registry
-from experiments.training.config import agent_schema
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
@@ -17,16 +13,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     run.benchmark(config, folder)
 
 
-def _schema(cfg: DictConfig) -> BenchmarkConfig:
-    """Use for each agent, controller and composition the config of its kind."""
-    return BenchmarkConfig(
-        agents={str(name): agent_schema(str(c.get("kind", "dqn"))) for name, c in cfg.agents.items()},
-        controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
-        compositions={str(name): registry.config(str(c.kind), registry.SHARE) for name, c in cfg.compositions.items()},
-    )
-
-
-main = frame.Command("benchmark", BenchmarkConfig(), benchmark, _schema)
+main = frame.Command("benchmark", BenchmarkConfig(), benchmark)
 
 
 if __name__ == "__main__":

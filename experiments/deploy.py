@@ -3,13 +3,9 @@
 import os
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
-from omegaconf import DictConfig
-
-from conf.schema import require
 from experiments.cli import frame
-from experiments.control.config import DeployConfig, deploy_schema
+from experiments.control.config import DeployConfig
 from experiments.control.notify import hidden
 
 
@@ -20,17 +16,6 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     if config.dry_run:
         raise frame.UserError("dry_run=true: a sweep has no timetable; drop --multirun")
     run.deploy(config, folder)
-
-
-def _schema(cfg: DictConfig) -> DeployConfig:
-    composition = cfg.get("composition")
-    law = None if composition is None else str(composition.kind)
-    given: Any = cfg.get("signals") or DictConfig({})
-    require(isinstance(given, DictConfig), "signals", given, "a law for each, as signals.NAME.kind=LAW")
-    for name, part in given.items():
-        require(isinstance(part, DictConfig), f"signals.{name}", part, f"a law, as signals.{name}.kind=LAW")
-    own = {str(name): str(part.get("kind")) for name, part in given.items()}
-    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind), law, own)
 
 
 class _Deploy(frame.Command[DeployConfig]):
@@ -49,7 +34,7 @@ class _Deploy(frame.Command[DeployConfig]):
         print(timetable(self.config(plain), place, datetime.now()))
 
 
-main = _Deploy("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
+main = _Deploy("deploy", DeployConfig(), deploy, resumes="state.json")
 
 
 if __name__ == "__main__":

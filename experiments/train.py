@@ -2,10 +2,8 @@
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from experiments.cli import frame
-from experiments.training.config import TrainConfig, agent_schema, env_schema
+from experiments.training.config import TrainConfig
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -15,13 +13,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     return run.train(config, folder)
 
 
-def _schema(cfg: DictConfig) -> TrainConfig:
-    """Use for environment and agent the config of its kind."""
-    env, agent = cfg.env.get("kind", "density"), cfg.agent.get("kind", "dqn")
-    return TrainConfig(env=env_schema(str(env)), agent=agent_schema(str(agent)))
-
-
-main = frame.Command("train", TrainConfig(), train, _schema, resumes="checkpoint.pt", goes_on=True)
+main = frame.Command("train", TrainConfig(), train, resumes="checkpoint.pt", goes_on=True)
 
 
 if __name__ == "__main__":

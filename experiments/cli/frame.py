@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Generic, TextIO, TypeVar, cast
@@ -152,14 +152,17 @@ def save_config(config: Any, folder: Path) -> None:
     OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
 
 
-def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
+def _stored(path: Path, resume: str, schema: T) -> T:
     """Read the config a run was started with. Raises: UserError naming the file and what is wrong with it."""
     try:
         stored = files.load_yaml(path)
         if not isinstance(stored, DictConfig):
             raise UserError("it holds no keys and values")
         stored.resume = resume
-        return load(stored, fitting(stored))
+        config = load(stored, schema)
+        if missing := [f.name for f in fields(cast(Any, schema)) if f.name not in stored]:
+            raise UserError(f"it has no {missing[0]}")
+        return config
     except (UserError, OSError, ValueError, AttributeError, OmegaConfBaseException) as error:
         why = _one_line(error) or type(error).__name__
         older = "a run of an earlier version goes on with that version only"
@@ -174,7 +177,6 @@ class Command(Generic[T]):
     name: of `conf/<name>.yaml` and of the job.
     schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
     body: called with the checked config and the run folder; a float it returns is the sweep's objective.
-    choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
     resumes: the file in a run folder without which `resume=` cannot go on, "" for a command that has no `resume=`.
     goes_on: a job of a sweep that was stopped goes on from that file by itself, to the same result; others start anew.
     """
@@ -182,18 +184,13 @@ class Command(Generic[T]):
     name: str
     schema: T
     body: Callable[[T, Path], float | None]
-    choose: Callable[[DictConfig], T] | None = None
     resumes: str = ""
     goes_on: bool = False
-
-    def fitting(self, cfg: DictConfig) -> T:
-        """Return the schema of a composed config."""
-        return self.schema if self.choose is None else self.choose(cfg)
 
     def config(self, overrides: Sequence[str] = ()) -> T:
         """Return the checked config of a command line. Raises: UserError."""
         cfg = compose(self.name, overrides)
-        return load(cfg, self.fitting(cfg))
+        return load(cfg, self.schema)
 
     def __call__(self) -> None:
         """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
@@ -306,9 +303,9 @@ class Command(Generic[T]):
             return self._swept_job(cfg, folder)
         try:
             if cfg.get("resume"):
-                config = _stored(folder / "config.yaml", str(cfg.resume), self.fitting)
+                config = _stored(folder / "config.yaml", str(cfg.resume), self.schema)
             else:
-                config = load(cfg, self.fitting(cfg))
+                config = load(cfg, self.schema)
                 save_config(config, folder)
                 extensions.keep(folder)
             with stop.unmasked():
@@ -344,12 +341,12 @@ class Command(Generic[T]):
     def _once(self, cfg: DictConfig, folder: Path, job: sweep.Job) -> float | None:
         """Run what is missing of a job."""
         try:
-            config = load(cfg, self.fitting(cfg))
+            config = load(cfg, self.schema)
             job.begin(config)
             if job.state == "finished":
                 return job.objective
             if self.goes_on and (folder / self.resumes).is_file():
-                config = _stored(folder / "config.yaml", str(folder), self.fitting)
+                config = _stored(folder / "config.yaml", str(folder), self.schema)
             else:
                 job.put_aside()
                 save_config(config, folder)

@@ -72,11 +72,10 @@ def _anchor(heading: str) -> str:
 def _variants(command: Command[Any]) -> Iterator[Any]:
     """Yield the command's config with every kind of backend and controller that it may hold."""
     yield command.config()
-    if command.choose:
-        for group in ("backend", "controller", "composition"):
-            if group in chosen(command.name):
-                for option in groups()[group]:
-                    yield command.config([f"{group}={option}"])
+    for group in ("backend", "controller", "composition"):
+        if group in chosen(command.name):
+            for option in groups()[group]:
+                yield command.config([f"{group}={option}"])
 
 
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:

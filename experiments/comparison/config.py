@@ -8,6 +8,7 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.laws import registry
+from experiments.training.config import agent_schema
 
 __all__ = ["SETTLING_MIN", "TABLE_2", "TWIN", "BenchmarkConfig", "Published", "StudyConfig"]
 
@@ -39,7 +40,7 @@ class BenchmarkConfig:
         0, "of plants, noise, training and calibration; every controller meets the same draws", at_least=0
     )
     env: EnvConfig = part(EnvConfig, "what model-based controllers believe, and agents are trained on")
-    agents: dict[str, Any] = setting({}, "learned controllers by name")
+    agents: dict[str, Any] = setting({}, "learned controllers by name", kinds=agent_schema)
     train_seeds: int = setting(
         4, "seeds an agent is trained with; the best policy on the selection grid controls", within=(1, 1000)
     )
@@ -62,8 +63,8 @@ class BenchmarkConfig:
         None, "a twin.yaml of calibrate, as plant `twin`; each vial begins at an hour of its own, drawn over its knots"
     )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
-    controllers: dict[str, Any] = setting({}, "controllers by name")
-    compositions: dict[str, Any] = setting({}, "laws of the composition by name")
+    controllers: dict[str, Any] = setting({}, "controllers by name", kinds=registry.config_at)
+    compositions: dict[str, Any] = setting({}, "laws of the composition by name", kinds=registry.config_at)
     composition_policies: dict[str, str] = setting(
         {}, "policies of learned laws of the composition by name: `shipped`, a policy.npz or a run folder"
     )

@@ -1,6 +1,5 @@
 """The config of a closed loop: reactors, controller, scenario and safety."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig", "deploy_schema"]
+__all__ = ["DeployConfig"]
 
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
@@ -25,7 +24,7 @@ OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
 class DeployConfig:
     """`python -m experiments.deploy`."""
 
-    backend: Any = part(SimulatedConfig, "what is controlled")
+    backend: Any = part(SimulatedConfig, "what is controlled", lambda kind, _: family(kind).config())
     plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
     bench: Bench = part(Bench, "volume, control period and pump: what everybody has to know alike")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
@@ -41,7 +40,7 @@ class DeployConfig:
         "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control "
         "each.M1.at_end=stop",
     )
-    controller: Any = part(LearnedConfig, "what decides the pump rate")
+    controller: Any = part(LearnedConfig, "what decides the pump rate", registry.config_at)
     policy: str = setting(
         "shipped",
         "of controller=dqn: `shipped`, the policy that comes with the program and needs no calibration; a policy.npz; "
@@ -59,6 +58,7 @@ class DeployConfig:
     composition: Any = setting(
         None,
         "what decides the temperature where the scenario asks for a share: a preset of `composition`; null: nothing",
+        kinds=registry.config_at,
     )
     composition_policy: str = setting(
         "shipped",
@@ -67,7 +67,9 @@ class DeployConfig:
     )
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
     signals: dict[str, Any] = setting(
-        {}, "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE"
+        {},
+        "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE",
+        kinds=registry.config_at,
     )
     pair: str = setting(
         "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
@@ -130,16 +132,3 @@ class DeployConfig:
     def roles(self) -> list[str]:
         """List what each reactor is for, in words of the user."""
         return [str(self.each.get(name, {}).get("role", "replicate")) for name in self.backend.reactors]
-
-
-def deploy_schema(
-    kind: str, controller: str = "dqn", composition: str | None = None, own: Mapping[str, str] | None = None
-) -> DeployConfig:
-    """Build the schema for the backend and laws of these kinds. Args: own: signal of one's own -> its law.
-
-    Raises: ValueError naming the kinds there are.
-    """
-    law = None if composition is None else registry.config(composition, registry.SHARE)
-    signals = {name: registry.config(law_of, name) for name, law_of in (own or {}).items()}
-    density = registry.config(controller)
-    return DeployConfig(backend=family(kind).config(), controller=density, composition=law, signals=signals)

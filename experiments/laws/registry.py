@@ -136,6 +136,16 @@ def config(kind: str, signal: str = DENSITY) -> Any:
     return _kind(kind, signal).config()
 
 
+def config_at(kind: str, key: str) -> Any:
+    """Return the default config of a law by where it stands: controller, compositions.NAME, signals.NAME.
+
+    Raises: ValueError naming the laws there are.
+    """
+    group, _, name = key.partition(".")
+    groups = {word + s: signal for signal, word in GROUPS.items() for s in ("", "s")}
+    return config(kind, groups.get(group, name))
+
+
 def build(
     config: Any,
     signal: str = DENSITY,

@@ -14,29 +14,29 @@ __all__ = ["AGENTS", "ENVS", "TrainConfig", "agent_schema", "env_schema"]
 ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
 
 
-def env_schema(kind: str) -> Any:
+def env_schema(kind: str, key: str = "env") -> Any:
     """Return the default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
     if kind not in ENVS:
-        raise ValueError(f"env.kind = {kind}: allowed {', '.join(ENVS)}")
+        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(ENVS)}")
     return ENVS[kind]()
 
 
 AGENTS: dict[str, type[Any]] = {"dqn": DQNConfig}
 
 
-def agent_schema(kind: str) -> Any:
-    """Return the default config of an agent of this kind. Raises: ValueError naming the kinds there are."""
-    if kind not in AGENTS:
-        raise ValueError(f"agent.kind = {kind}: allowed {', '.join(AGENTS)}")
-    return AGENTS[kind]()
+def agent_schema(kind: str, key: str = "agent") -> Any:
+    """Return the default config of an agent of this kind, "": dqn. Raises: ValueError naming the kinds there are."""
+    if (kind or "dqn") not in AGENTS:
+        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(AGENTS)}")
+    return AGENTS[kind or "dqn"]()
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
 
-    env: Any = part(EnvConfig, "the training model and its episodes")
-    agent: Any = part(DQNConfig, "the agent's hyper-parameters")
+    env: Any = part(EnvConfig, "the training model and its episodes", env_schema)
+    agent: Any = part(DQNConfig, "the agent's hyper-parameters", agent_schema)
     pair: str | None = setting(
         None,
         "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",

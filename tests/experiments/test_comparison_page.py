@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from experiments.benchmark import _schema
 from experiments.cli import frame
 from experiments.comparison import figures, page, studies
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
@@ -29,7 +28,7 @@ STEPS = (
 @cache
 def load(*overrides: str) -> BenchmarkConfig:
     cfg = frame.compose("benchmark", overrides)
-    return frame.load(cfg, _schema(cfg))
+    return frame.load(cfg, BenchmarkConfig())
 
 
 def trial(config: BenchmarkConfig, cell: Cell, number: int) -> DensityTrial:

@@ -14,7 +14,6 @@ from experiments.cli import frame
 from experiments.cli.frame import UserError, save_config
 from experiments.control.config import DeployConfig
 from experiments.control.policies import load_policy
-from experiments.deploy import _schema
 from experiments.record.record import Record
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
@@ -145,13 +144,13 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (b"", "Missing key backend"),
+        (b"", "it has no backend"),
         (b"7\n", "Invalid loaded object type: int"),
         (b"[1]\n", "it holds no keys and values"),
         (b"a: [", "while parsing a flow node"),
         (b"a: *x\n", "an alias or interpolation in line 1"),
         (b"\xff\xfe\0\1", "no UTF-8 text"),
-        (b"backend: x\n", "'str' object has no attribute 'kind'"),
+        (b"backend: x\n", "backend = x: allowed keys and values"),
         (b"backend:\n  kind: [1]\ncontroller:\n  kind: pi\n", "backend.kind = [1]: allowed sim, chibio, emulator"),
         (b"backend:\n  kind: sim\ncontroller:\n  kind: x\n", "controller.kind = x: allowed dqn"),
         (b"backend:\n  kind: sim\ncontroller:\n  kind: pi\nfsync: ${nowhere}\n", "an alias or interpolation in line 5"),
@@ -165,7 +164,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
     path = tmp_path / "config.yaml"
     path.write_bytes(content)
     with pytest.raises(UserError) as caught:
-        frame._stored(path, "RUN", _schema)
+        frame._stored(path, "RUN", DeployConfig())
     assert f"{path}: not the config of this run (" in str(caught.value)
     assert why in str(caught.value)
     assert str(caught.value).endswith("put it back as the run wrote it, or start a new run")
@@ -175,7 +174,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
 def test_a_config_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     config = DeployConfig(policy="here.npz")
     save_config(config, tmp_path)
-    loaded = frame._stored(tmp_path / "config.yaml", "RUN", _schema)
+    loaded = frame._stored(tmp_path / "config.yaml", "RUN", DeployConfig())
     assert (loaded.policy, loaded.resume) == ("here.npz", "RUN")
 
 

@@ -25,14 +25,15 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import run
-from experiments.control.config import DeployConfig, deploy_schema
+from experiments.control.config import DeployConfig
+from experiments.laws import registry
 from experiments.laws.registry import DENSITY, KINDS
 from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.family import EmulatorFamily
 from hardware.emulator.transport import EmulatorTransport
-from hardware.family import Opening
+from hardware.family import Opening, family
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.family import PioreactorFamily
 from hardware.storage.journal import Journal, read_journal
@@ -51,7 +52,7 @@ WHY = {  # what each controller says of a decision: name -> number of values per
 def config(kind: str, backend: str, folder: Path) -> DeployConfig:
     """Three minutes at 0.4 from a culture above it."""
     policy.save(folder / "given.npz", inverse_policy())
-    schema = deploy_schema(backend, kind)
+    schema = DeployConfig(backend=family(backend).config(), controller=registry.config(kind))
     reactors = replace(schema.backend, reactors=NAMES)
     plant = replace(schema.plant, start_od=0.5)
     scenario = Scenario((0.4,), (3.0,), (37.0,))
