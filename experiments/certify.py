@@ -37,7 +37,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
     with frame.refusing(policies.PolicyError):
         policy = policies.load(source)
     with frame.refusing(ValueError, about=f"policy {source}: "):
-        beside = settings(policy)
+        beside = settings(policy, config.estimator)
     with frame.refusing(CertificationError, about=f"policy {source}: "):
         config = replace(config, env=model_of(policy, config))
         found = certify(policy, config)

@@ -18,7 +18,7 @@ NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?
 FILES = {name: text for name, text in NAMED.findall(PAGE)}
 WHOLE = {  # named by the page
     name: (ROOT / "tests" / "extensions" / name).read_text(encoding="utf-8")
-    for name in ("light.py", "drug.py", "ppo.py")
+    for name in ("light.py", "drug.py", "ekf.py", "ppo.py")
 }
 COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
 SHORT = {
@@ -48,7 +48,7 @@ def summary(folder: Path) -> dict[str, object]:
 def test_the_page_names_every_file_it_shows() -> None:
     names = "steps.yaml", "gentle.py", "patient.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py"
     assert set(FILES) == set(names)
-    assert len(COMMANDS) == 13
+    assert len(COMMANDS) == 15
 
 
 @pytest.mark.slow

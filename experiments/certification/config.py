@@ -1,6 +1,7 @@
 """What a certificate is asked to prove."""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 from conf.schema import check, part, require, setting
 from envs.bench import Bench
@@ -90,6 +91,9 @@ class CertifyConfig:
     to: str | None = setting(
         None,
         "where the certificate goes beside the run folder; null: beside the policy, but never into the program itself",
+    )
+    estimator: dict[str, Any] = setting(
+        {}, "of a policy in relative coordinates: what replaces the settings in its file, as in deploy's controller"
     )
     bench: Bench = part(Bench, "where it is to run: full pump is max_rate period / tau with tau = volume / 60")
     env: EnvConfig | None = setting(

@@ -332,9 +332,14 @@ def test_settings_that_are_given_as_they_are_change_nothing(relative: Path, tmp_
 @pytest.mark.parametrize(
     ("module", "name", "value", "said"),
     [
-        (filters, "LOUD", 30.0, r"filter\.loud = 30\.0, certified 21\.0"),
-        (filters, "QUIET", 0.0, r"filter\.quiet = 0\.0, certified 0\.15"),
-        (filters, "GAIN_RANGE", (0.2, 9.0), r"filter\.gain_range = \[0\.2, 9\.0\], certified \[0\.2, 3\.0\]"),
+        (filters, "FIXED", filters.Fixed(loud=30.0), r"filter\.loud = 30\.0, certified 21\.0"),
+        (filters, "FIXED", filters.Fixed(quiet=0.0), r"filter\.quiet = 0\.0, certified 0\.15"),
+        (
+            filters,
+            "FIXED",
+            filters.Fixed(gain_range=(0.2, 9.0)),
+            r"filter\.gain_range = \[0\.2, 9\.0\], certified \[0\.2, 3\.0\]",
+        ),
         (learned, "WATCHED", 1.0, r"fallback\.watched_sd = 1\.0, certified 2\.0"),
     ],
 )
@@ -364,7 +369,7 @@ def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
     assert set(settings(laws.share_law())) == {
         *(f"{prefix}estimator.{key}" for prefix in ("", "fallback.") for key in asdict(EstimatorConfig())),
         *(f"fallback.{key}" for key in ("law", "watched_sd")),
-        *(f"filter.{key.lower()}" for key in learned.FIXED),
+        *(f"filter.{key}" for key in filters.fixed()),
     }
 
 

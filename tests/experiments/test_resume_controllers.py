@@ -1,6 +1,7 @@
 """A run that is stopped or killed and resumed: its controller decides what one that never stopped decides."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from experiments.cli import files
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Array, Controller, Mask
+from experiments.laws.density import estimators
 from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
@@ -26,12 +28,13 @@ from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.extensions import ekf  # noqa: F401  (registers its estimator)
 from tests.hardware.emulator_lab import quiet
 
 pytestmark = pytest.mark.numeric
 
 NAMES = ("M0", "M1", "M2")
-KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold")
+KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold", "inverse ekf", "dqn ekf")
 SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5)
 LENGTH, CUT = 44, 26
 HOLD = Scenario((0.5,), (600.0,), (37.0,))
@@ -44,7 +47,11 @@ REQUESTS = {  # what a program is killed at -> whether the dose under way was gi
 
 
 def controller(kind: str) -> Controller:
-    config = registry.config(kind)
+    law, _, estimator = kind.partition(" ")
+    config = registry.config(law)
+    if estimator:
+        believed = {"kind": estimator} if law == "dqn" else estimators.config_at(estimator)
+        config = replace(config, estimator=believed)
     if kind == "threshold":
         config = type(config)(hysteresis=0.05)
     policy = load_policy("shipped", 1.0, 0.02)

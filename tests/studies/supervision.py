@@ -7,7 +7,7 @@ with the supervisor, without it, and under the one-line law on that filter; and 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from unittest.mock import patch
@@ -79,7 +79,7 @@ def shipped(estimator: EstimatorConfig | None = None) -> RelativeController:
 @contextmanager
 def deaf() -> Iterator[None]:
     """Inside, no surprise alarms anybody."""
-    with patch.object(filters, "LOUD", np.inf), patch.object(filters, "QUIET", -1.0):
+    with patch.object(filters, "FIXED", replace(filters.FIXED, loud=np.inf, quiet=-1.0)):
         yield
 
 

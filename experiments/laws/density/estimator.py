@@ -1,6 +1,7 @@
 """What a run knows of one vial: a Kalman filter for OD, growth rate, pump gain and what temperature does to growth."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,21 +10,31 @@ from conf.schema import check, setting
 from envs.task import EnvConfig
 from experiments.laws.base import Array, Mask, usable
 
-__all__ = ["LOWEST_OD", "Estimator", "EstimatorConfig"]
+__all__ = ["Estimator", "EstimatorConfig", "fixed"]
 
-LOWEST_OD = 0.005  # below it the logarithm of a reading says nothing
-GAIN_RANGE = (0.2, 3.0)  # of the relative pump gain; a head outside is broken, not slow
-NOISE_RANGE = (0.1, 25.0)  # of the learned variance over the assumed one
-TREND_WEIGHT = 0.4  # of the newest surprise in their running mean
-TREND_SD = (TREND_WEIGHT / (2.0 - TREND_WEIGHT)) ** 0.5  # of that mean while the model holds
-CALM = 1.5  # a mean within so many of its sd is no sign of a change
-FARTHEST = 3.0  # a surprise beyond so many of its sd tells no more
-LAST, LONG = 10, 40  # newest readings whose surprises are watched: too large ones, too small ones
-LOUD = 21.0  # their sum of squares over `LAST` above which the filter is wrong: less than once a day on a sound reactor
-QUIET = 6.0 / 40.0  # their mean over `LONG` below which it takes itself for less sure than it is
-USUAL = 0.75  # the mean on a sound reactor
+USUAL = 0.75  # the mean square of a surprise on a sound reactor
 SHARE_SD = 0.02  # what the growth share that holds at rest changes by beside the filter's error of it
 LOG_OD, MU, GAIN, WARMTH = range(4)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """What no setting of the filter changes, and decides as well; a certificate names it beside the settings."""
+
+    lowest_od: float = 0.005  # below it the logarithm of a reading says nothing
+    gain_range: tuple[float, float] = (0.2, 3.0)  # of the relative pump gain; a head outside is broken, not slow
+    noise_range: tuple[float, float] = (0.1, 25.0)  # of the learned variance over the assumed one
+    trend_weight: float = 0.4  # of the newest surprise in their running mean
+    calm: float = 1.5  # a mean within so many of its sd is no sign of a change
+    farthest: float = 3.0  # a surprise beyond so many of its sd tells no more
+    last: int = 10  # newest readings whose surprises are watched for too large ones ...
+    long: int = 40  # ... and for too small ones
+    loud: float = 21.0  # sum of the last squares above which the filter is wrong: less than once a day if it is right
+    quiet: float = 6.0 / 40.0  # mean of the long ones below which it takes itself for less sure than it is
+
+
+FIXED = Fixed()
+TREND_SD = (FIXED.trend_weight / (2.0 - FIXED.trend_weight)) ** 0.5  # of that mean while the model holds
 
 
 @dataclass(frozen=True)
@@ -35,6 +46,7 @@ class EstimatorConfig:
     spread of a dose is 0.05 to 0.30. Growth falls by up to 40 % from 37 to 30 degC.
     """
 
+    kind: str = setting("kalman", "which estimator")
     noise_floor: float = setting(0.005, "sd of a reading = hypot(floor, relative * OD)", "OD", within=(1e-4, 0.1))
     noise_relative: float = setting(0.003, "see noise_floor", within=(0, 0.1))
     noise_memory: float = setting(
@@ -77,6 +89,11 @@ class EstimatorConfig:
         check(self, "controller.estimator")
 
 
+def fixed() -> dict[str, Any]:
+    """Return what decides beside the settings, by name."""
+    return asdict(FIXED)
+
+
 class Estimator:
     """State z = [ln x, mu, g, w]: OD x, growth rate mu at the first temperature T0, relative pump gain g, w = dmu/dT.
 
@@ -112,7 +129,7 @@ class Estimator:
         self._noise, self._learned = np.ones(n), np.zeros(n)
         self._far, self._far_surprise = np.zeros(n, dtype=np.int64), np.zeros(n)
         self._trend = np.zeros(n)  # running mean of the surprises in units of their sd
-        self._squares = np.full((n, LONG), np.nan)  # squares of the newest of them
+        self._squares = np.full((n, FIXED.long), np.nan)  # squares of the newest of them
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL, (N,)."""
@@ -135,7 +152,7 @@ class Estimator:
         idx = np.flatnonzero(usable(od, rows) & ~(minute <= self._minute))
         if not idx.size:
             return
-        reading = np.maximum(od[idx], LOWEST_OD)
+        reading = np.maximum(od[idx], FIXED.lowest_od)
         assumed = np.hypot(self.config.noise_floor, self.config.noise_relative * reading) ** 2 / reading**2
         began = ~np.isnan(self._minute[idx])
         dt = np.where(began, minute[idx] - np.where(began, self._minute[idx], 0.0), 0.0)
@@ -163,7 +180,7 @@ class Estimator:
         spread = np.hypot(c.pulse_cv, np.where(first, c.first_dose_sd, 0.0))
         step = np.tile(np.eye(4), (n, 1, 1))
         step[:, LOG_OD, MU], step[:, LOG_OD, GAIN], step[:, LOG_OD, WARMTH] = dt, -dose * arrives, dt * warmer
-        faster = 1.0 + c.hurry * np.maximum(np.abs(self._trend[idx]) / TREND_SD - CALM, 0.0) ** 2
+        faster = 1.0 + c.hurry * np.maximum(np.abs(self._trend[idx]) / TREND_SD - FIXED.calm, 0.0) ** 2
         noise = np.zeros((n, 4, 4))
         noise[:, LOG_OD, LOG_OD] = (spread * dose) ** 2 + (c.growth_cv * self.model.mu) ** 2 * dt
         noise[:, MU, MU], noise[:, GAIN, GAIN] = c.mu_walk**2 * dt * faster, c.gain_walk**2 * dt * faster
@@ -195,9 +212,9 @@ class Estimator:
         self.cov[idx] = np.where(anew[:, None, None], fresh, smaller)
         self._far[idx] = np.where(anew, 0, self._far[idx])
         self._learn(idx[~far & began], (surprise**2 - cov[:, LOG_OD, LOG_OD])[~far & began] / assumed[~far & began])
-        square = np.where(began, np.minimum(surprise**2 / total, FARTHEST**2), np.nan)
+        square = np.where(began, np.minimum(surprise**2 / total, FIXED.farthest**2), np.nan)
         self._squares[idx] = np.concatenate([self._squares[idx, 1:], square[:, None]], axis=1)
-        trend = self._trend[idx] + TREND_WEIGHT * (surprise / np.sqrt(total) - self._trend[idx])
+        trend = self._trend[idx] + FIXED.trend_weight * (surprise / np.sqrt(total) - self._trend[idx])
         self._trend[idx] = np.where(anew, 0.0, np.where(far, self._trend[idx], trend))
 
     def _learn(self, idx: NDArray[np.intp], observed: Array) -> None:
@@ -206,13 +223,13 @@ class Estimator:
             return
         self._learned[idx] += 1.0
         weight = 1.0 / np.minimum(self._learned[idx] + 5.0, self.config.noise_memory)
-        level = self._noise[idx] + weight * (np.clip(observed, 0.0, NOISE_RANGE[1]) - self._noise[idx])
-        self._noise[idx] = np.clip(level, *NOISE_RANGE)
+        level = self._noise[idx] + weight * (np.clip(observed, 0.0, FIXED.noise_range[1]) - self._noise[idx])
+        self._noise[idx] = np.clip(level, *FIXED.noise_range)
 
     @property
     def gain(self) -> Array:
         """Relative pump gain within what a pump can be, (N,)."""
-        return np.asarray(np.clip(self.mean[:, GAIN], *GAIN_RANGE))
+        return np.asarray(np.clip(self.mean[:, GAIN], *FIXED.gain_range))
 
     @property
     def full_pump(self) -> Array:
@@ -224,19 +241,24 @@ class Estimator:
         """Error e = ln(x/r)/B and growth share s = mu h / B now (`envs/relative.py`), each (N,)."""
         warmer = np.nan_to_num(self._warm - self._first_warm)
         mu = self.mean[:, MU] + self.mean[:, WARMTH] * warmer
-        error = self.mean[:, LOG_OD] - np.log(np.maximum(setpoint, LOWEST_OD))
+        error = self.mean[:, LOG_OD] - np.log(np.maximum(setpoint, FIXED.lowest_od))
         return error / self.full_pump, mu * self.model.control_min / self.full_pump
 
     @property
     def loudness(self) -> Array:
         """Sum of squares of the last ten surprises in units of their sd, each at most 9; about 8 where all is well."""
-        return np.asarray(np.nansum(self._squares[:, -LAST:], axis=1))
+        return np.asarray(np.nansum(self._squares[:, -FIXED.last :], axis=1))
+
+    @property
+    def loud(self) -> NDArray[np.bool_]:
+        """Whether that is more than can be, (N,)."""
+        return np.asarray(self.loudness > FIXED.loud)
 
     @property
     def quiet(self) -> NDArray[np.bool_]:
         """Whether they have long been far smaller, (N,)."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(self._squares.mean(axis=1) < QUIET)
+            return np.asarray(self._squares.mean(axis=1) < FIXED.quiet)
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
         """Return the filter's standard deviations of the error e and of the growth share s of `relative`, each (N,).
@@ -260,7 +282,7 @@ class Estimator:
         slope[:, LOG_OD], slope[:, GAIN] = 1.0 / self.full_pump, -self.relative(setpoint)[0] / self.gain
         error = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", slope, self.cov, slope), 0.0))
         larger = np.ones_like(share)
-        for recent in (self._squares[:, -LAST:], self._squares):
+        for recent in (self._squares[:, -FIXED.last :], self._squares):
             count = np.maximum(np.isfinite(recent).sum(axis=1), 1)
             larger = np.maximum(larger, np.sqrt(np.nansum(recent, axis=1) / count / USUAL))
         return error * larger, np.hypot(share * larger, SHARE_SD)

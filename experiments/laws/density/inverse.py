@@ -1,6 +1,7 @@
 """Inverse control on the estimator: the pump rate that puts the next reading on the setpoint."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -8,7 +9,8 @@ from conf.schema import part, require, setting
 from envs.relative import nearest_level
 from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
-from experiments.laws.density.estimator import Estimator, EstimatorConfig
+from experiments.laws.density import estimators
+from experiments.laws.density.estimator import EstimatorConfig
 
 __all__ = ["Inverse", "InverseConfig"]
 
@@ -21,7 +23,7 @@ class InverseConfig(ControllerConfig):
     levels: int = setting(
         0, "pump rates it chooses from, equally spaced, the nearest one; 0: any rate", within=(0, 1001)
     )
-    estimator: EstimatorConfig = part(EstimatorConfig, "what the filter believes")
+    estimator: Any = part(EstimatorConfig, "what the filter believes", estimators.config_at)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,7 +42,7 @@ class Inverse:
 
     def __init__(self, config: InverseConfig, model: EnvConfig) -> None:
         self.model, self._levels = model, config.levels
-        self.estimator = Estimator(config.estimator, model)
+        self.estimator = estimators.build(config.estimator, model)
         self.reset(1)
 
     def reset(self, n: int) -> None:

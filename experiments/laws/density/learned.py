@@ -12,16 +12,12 @@ from dqn.policy import RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.laws.base import Array, Controller, ControllerConfig, Mask, usable
-from experiments.laws.density import estimator as filters
-from experiments.laws.density.estimator import Estimator, EstimatorConfig
+from experiments.laws.density import estimators
+from experiments.laws.density.estimator import EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
 WATCHED = 2.0  # sd of an estimate that count as its error
-FIXED = (
-    "LOWEST_OD", "GAIN_RANGE", "NOISE_RANGE", "TREND_WEIGHT", "CALM", "FARTHEST", "LAST", "LONG", "LOUD", "QUIET",
-)  # fmt: skip
-"""What no setting of a filter changes, and decides as well."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,13 @@ def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: Est
     return RelativeController(policy, _estimator(policy, config.estimator), model, bounds)
 
 
-def _estimator(policy: Policy, changes: Mapping[str, Any]) -> EstimatorConfig:
-    own = build(EstimatorConfig(), policy.metadata.get("estimator", {}), "policy.estimator")
+def _estimator(policy: Policy, changes: Mapping[str, Any]) -> Any:
+    """Put changes into the settings of a policy's file; another kind begins at its own. Raises: ValueError."""
+    filed = policy.metadata.get("estimator", {})
+    kind = str(filed.get("kind", ""))
+    if (asked := str(changes.get("kind", kind))) != kind:
+        filed = {}
+    own = build(estimators.config_at(asked), filed, "policy.estimator")
     return build(own, dict(changes), "controller.estimator")
 
 
@@ -57,13 +58,9 @@ def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) 
     """
     if policy.observation != RELATIVE:
         return {}
-    own = {f"estimator.{key}": value for key, value in asdict(_estimator(policy, changes)).items()}
     second = {f"fallback.estimator.{key}": value for key, value in asdict(EstimatorConfig()).items()}
     law = {"fallback.law": "clip(e + s, 0, 1)", "fallback.watched_sd": WATCHED}
-    fixed = {name: getattr(filters, name) for name in FIXED}
-    return (
-        own | second | law | {f"filter.{n.lower()}": list(v) if isinstance(v, tuple) else v for n, v in fixed.items()}
-    )
+    return estimators.settings(_estimator(policy, changes)) | second | law
 
 
 class LearnedController:
@@ -115,11 +112,9 @@ class RelativeController:
 
     remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm")
 
-    def __init__(
-        self, policy: Policy, estimator: EstimatorConfig, model: EnvConfig, bounds: EstimateBounds | None = None
-    ) -> None:
+    def __init__(self, policy: Policy, estimator: Any, model: EnvConfig, bounds: EstimateBounds | None = None) -> None:
         self.policy, self.model, self.bounds = policy, model, bounds
-        self.estimator, self.second = Estimator(estimator, model), Estimator(EstimatorConfig(), model)
+        self.estimator, self.second = (estimators.build(one, model) for one in (estimator, EstimatorConfig()))
         self.reset(1)
 
     def reset(self, n: int) -> None:
@@ -141,8 +136,8 @@ class RelativeController:
             each.see(od, minute, rows)
         now = usable(od, rows)
         observation, sure = (np.stack(pair(setpoint), axis=1) for pair in (self.estimator.relative, self.estimator.sd))
-        q, loud = self.policy.q_values(observation), self.estimator.loudness > filters.LOUD
-        alarm = loud | (self.estimator.quiet & ~self.second.quiet)
+        q = self.policy.q_values(observation)
+        alarm = self.estimator.loud | (self.estimator.quiet & ~self.second.quiet)
         supervised = alarm | self._outside(setpoint, observation)
         error, share = self.second.relative(setpoint)
         rate = np.where(supervised, np.clip(error + share, 0.0, 1.0), self.policy.actions[q.argmax(axis=1)])
