@@ -9,7 +9,7 @@ from hardware.errors import DeviceStateError, IdentityError, LinkError, Protocol
 from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, no_log
 
-__all__ = ["Connection", "identity"]
+__all__ = ["DRAIN", "Connection", "identity"]
 
 SEEN_S = 1.0
 """For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
@@ -215,7 +215,7 @@ class Connection:
                 if not on:
                     return
                 if set(on) - {WASTE} and WASTE not in state.running_pumps:
-                    self._drain(state)
+                    self.drain()
             except (LinkError, ProtocolError) as failed:
                 error = failed
                 continue
@@ -225,10 +225,9 @@ class Connection:
         assert error is not None
         raise error
 
-    def _drain(self, state: DeviceState) -> None:
-        """Waste pump on, as long as a feed pump may run. Raises: as `post`."""
-        if not state.pump_targets[PUMPS.index(WASTE)] >= DRAIN:  # also nan
-            self.target(WASTE, DRAIN)
+    def drain(self) -> None:
+        """Waste pump on, where a feed pump may run or has run without it. Raises: as `post`."""
+        self.target(WASTE, DRAIN)
         self.switch(WASTE, True)
 
     def probe(self) -> None:

@@ -8,11 +8,11 @@ import numpy as np
 
 from hardware.chibio.agenda import Agenda, Task
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection
+from hardware.chibio.connection import DRAIN, Connection
 from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
-from hardware.chibio.ending import conclude, found
-from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
+from hardware.chibio.ending import SAME_S, conclude, found
+from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.logbook import Logbook
@@ -54,7 +54,8 @@ class DoseSequence:
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
       what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
-      sample a dose was decided for, None where the device's records begin anew.
+      sample a dose was decided for, None where the device's records begin anew; stray_s,
+      clock time at which somebody's dose was last seen or told.
     """
 
     def __init__(self, context: Context) -> None:
@@ -68,14 +69,18 @@ class DoseSequence:
         self.acted: tuple[float, int] | None = None
         self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
-        self._given_up: list[ReactorHistory] = []  # their feed command brought no answer and may yet be carried out
-        self._unanswered = False  # of the dose under way
-        self._late, self._off_s = False, 0.0  # whether it is now; run time at which the pumps were last verified off
+        self._given_up: dict[str, float] = {}  # pumps whose command brought no answer and may yet be carried out, since
+        self.stray_s = -math.inf
+        self._strays: dict[str, tuple[float, float, float]] = {}  # pumps that no dose has: off until, seen on, target
+        self._targets: dict[str, float] = {}  # of feed pumps, as last seen
+        self._quiet_s = 0.0  # run time at which no pump was on that no dose has
+        self._undrained = False
         self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
 
     def restore(self) -> None:
         """Continue as an earlier life of the run left it; its pumps are to be verified off next."""
         history = self._past()
+        self._quiet_s = history.seen_s
         self.acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
         if history.open:
             self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open by an earlier life of the program")
@@ -93,8 +98,9 @@ class DoseSequence:
     @property
     def late(self) -> str:
         """The pump whose command was given up and may still be carried out, "" if there is none."""
-        self._given_up = [lost for lost in self._given_up if self._book.elapsed() < lost.on_s + LATE_S]
-        return self._given_up[-1].feed_pump if self._given_up else ""
+        now_s = self._book.elapsed()
+        self._given_up = {pump: at_s for pump, at_s in self._given_up.items() if now_s < at_s + LATE_S}
+        return next(reversed(self._given_up), "")
 
     def begin(
         self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
@@ -179,7 +185,6 @@ class DoseSequence:
                 self._book.tell(f"the link is slow: the feed pump's command was answered after {took_s:.1f} s")
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             self._in_doubt()
-            self._unanswered = fed
             self._book.tell(
                 f"the answer to the feed pump's command was lost, what it did is looked for: {error}" if fed
                 else f"no dose: {error}"
@@ -252,8 +257,6 @@ class DoseSequence:
         connection = self._connection
         try:
             self._look_first()
-            if self.late and not (self._past().open and self._past().fed):
-                self._late = self._late or self.late in connection.read().running_pumps
             connection.pumps_off(tries, PUMPS if overflow_pump else self._config.overflow_pump.others)
         except ReactorError as error:
             if isinstance(error, DeviceStateError) and connection.state is not None:
@@ -261,11 +264,12 @@ class DoseSequence:
             self._in_doubt()
             raise
         self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
-        if self._late and self._given_up:
-            self._book_late(self._given_up.pop())  # the newest: its duty is the one that is set
         if (known := self._past()).open:
             self._conclude(known)
-        self._off_s = self._book.elapsed()
+        for pump, (off_s, seen_s, target) in self._strays.items():
+            self._book_stray(pump, target, off_s, seen_s)
+        self._strays.clear()
+        self._quiet_s = self._book.elapsed()
 
     def _in_doubt(self) -> None:
         """Note that a request was not answered: from the last answer on the device may have done otherwise."""
@@ -273,22 +277,52 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """As pumps are found says what became of a dose: before they are switched off, where nobody saw its course.
+        """As pumps are found says what became of a dose, so they are looked at before they are switched off.
 
-        That is after an answer was missing, and where an earlier life of the program left the dose open.
+        They are switched off without that where nothing was missed. That is not so after an answer was missing, and
+        where an earlier life of the program left the dose open.
         """
         left = self._past().open and not self.running
-        if not math.isnan(seen_s := self._past().seen_s if left else self._doubt_s):
-            self._look(self._connection.read(), seen_s)
-            self._doubt_s = self._book.elapsed()
+        seen_s = self._past().seen_s if left else self._doubt_s
+        try:
+            state = self._connection.read()
+        except ReactorError:
+            if math.isnan(seen_s):
+                return
+            raise
+        self.watch(state)
+        self._look(state, seen_s)
+        self._doubt_s = seen_s if math.isnan(seen_s) else self._book.elapsed()
+
+    def watch(self, state: DeviceState, ours: bool = True) -> None:
+        """Note each feed pump that is on, or has got another target, and not by a dose. Args: ours: nobody else may."""
+        known, now = self._past(), self._book.elapsed()
+        if not ours or state.start_time != known.start_time:
+            self._targets.clear()
+        for pump in (FEED, *self._config.supply.pumps):
+            target, before = state.pump_targets[PUMPS.index(pump)], self._targets.get(pump, math.nan)
+            self._targets[pump] = target
+            if not ours or (known.open and pump == known.feed_pump):
+                continue
+            if pump in state.running_pumps:
+                self._strays.setdefault(pump, (self._quiet_s, now, target))
+            elif pump not in self._strays and abs(target - before) > 1e-5:
+                self._book_stray(pump, target, self._quiet_s, math.nan)
+        if self._strays:
+            self.stray_s = self._clock.now()
+        else:
+            self._quiet_s = now
 
     def _look(self, state: DeviceState, seen_s: float) -> None:
-        """Write down what a look at the device says of the pumps of an open dose. Args: seen_s: run time before it."""
+        """Write down what a look at the device says of the pumps of an open dose.
+
+        Args: seen_s: run time of the last answer before it, nan if none was missing.
+        """
         known, now, stopped = self._past(), self._book.elapsed(), None
         if not known.open:
             return
         try:
-            ago_s = self._connection.switched_off()
+            ago_s = {} if math.isnan(seen_s) else self._connection.switched_off()
             stopped = {pump: now - s for pump, s in ago_s.items() if now - s > known.on_s}
         except ReactorError as error:
             self._book.tell(f"the board agent does not say what it switched off: {error}")
@@ -296,8 +330,10 @@ class DoseSequence:
             self._book.tell(f"the board agent switched off in a dose: {', '.join(stopped)}")
         if known.experiment not in ("", state.start_time):
             self._book.tell("the device was restarted in a dose, which ended it")
-        if added := found(known, state, now, seen_s, self._config.deadman_s, stopped):
+        if added := found(known, state, now, now if math.isnan(seen_s) else seen_s, self._config.deadman_s, stopped):
             self._book.log("found", **added)
+            if {"feed_anew", "waste_anew"} & added.keys():
+                self._book.tell("a pump was found with another target, or on again, in a dose: was the web page used?")
 
     def _conclude(self, known: ReactorHistory) -> None:
         """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
@@ -308,18 +344,47 @@ class DoseSequence:
         self._book.log("dose_end", **ending.row())
         booked_ml = known.feed_ml if known.fed else 0.0
         self.extra += ending.beyond(booked_ml)
-        if known.fed and (self._unanswered or math.isnan(known.feed_on[1])):
-            self._given_up.append(known)
-        self._unanswered = False
+        if known.fed and known.feed_pump in (self.late, *self._given_up) and not note:
+            twice = f"{ending.feed_ml:.2f} to {2.0 * ending.feed_ml:.2f} mL, booked as the former"
+            self._book.tell(f"a dose gave {twice}: a feed command that was given up may have been heard in it")
+        if known.fed and math.isnan(known.feed_on[1]):
+            self._given_up.pop(known.feed_pump, None)
+            self._given_up[known.feed_pump] = known.on_s
 
-    def _book_late(self, lost: ReactorHistory) -> None:
-        """Record and book a feed command that was given up and carried out after the pumps were verified off."""
-        again = replace(lost, open=True, on_s=self._off_s, wasted=False, feed_on=NEVER, feed_off=NEVER)
-        ending, _ = conclude(again, self._book.elapsed(), self._calibrated(lost.feed_pump), self._calibration.waste)
-        given = ending.beyond(0.0)
-        total_ml = sum(one.feed_ml for one in given)
+    def _book_stray(self, pump: str, target: float, off_s: float, seen_s: float) -> None:
+        """Book what a pump gave that no dose had. Args: it was off at off_s, and seen on at seen_s, nan if never."""
+        self.stray_s = self._clock.now()
+        known, late = self._past(), pump in (self.late, *self._given_up)
+        dose_s = PERIOD_S * target if target > 0.0 else 0.0
+        if known.feed_pump == pump and abs(dose_s - known.feed_s) <= SAME_S:
+            seen_s = math.nan  # an old answer, delivered again, looks the same
+        other = replace(
+            known, open=True, feed_ml=0.0, feed_s=dose_s, feed_pump=pump, on_s=off_s, fed=True, wasted=False,
+            feed_on=(off_s, seen_s), feed_off=NEVER, feed_anew=NEVER,
+        )  # fmt: skip
+        ending, _ = conclude(other, self._book.elapsed(), self._calibrated(pump), self._calibration.waste)
+        why = f"{pump} was used by somebody, at a target of {target:g}"
+        if late:
+            why = "a feed command that was given up was heard late"
+            self._given_up.pop(pump)
+        state = self._connection.state
+        alone = state is None or not (state.regulating or state.pumping_modes)  # else the waste pump has run beside it
+        given = [replace(one, waste_ml=one.waste_ml * (not alone)) for one in ending.beyond(0.0)]
         for one in given:
-            self._book.log("given", **one.row("heard late"))
-        self._book.tell(f"a feed command that was given up was heard late: {total_ml:.2f} mL, booked")
+            self._book.log("given", **one.row("heard late" if late else "by somebody"))
+        total_ml, low_ml = sum(one.feed_ml for one in given), sum(one.low_ml for one in given)
+        self._book.tell(f"{why}: {low_ml:.2f} to {total_ml:.2f} mL, booked as the latter")
         self.extra += given
-        self._late = False
+        self._undrained = self._undrained or (alone and bool(given))
+
+    def drain(self) -> None:
+        """Waste pump on for a while, where a vial got medium without it. Raises: ReactorError."""
+        if not self._undrained or self.running:
+            return
+        self._undrained, self.running, now_s = False, True, self._book.elapsed()
+        self._agenda.add(self._finish(), PERIOD_S * DRAIN + DOSE_OFF_S)
+        self._due_s = self._clock.now() + PERIOD_S * DRAIN + DOSE_OFF_S
+        self._connection.drain()
+        drained = Given(now_s, 0.0, 0.0, self._calibration.waste.volume(PERIOD_S * DRAIN))
+        self._book.log("given", **drained.row("drained"))
+        self.extra.append(drained)

@@ -7,16 +7,17 @@ exactly, it lies between two times, and what was given between two volumes.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hardware.chibio.dosing import PumpCalibration
 from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
-from hardware.chibio.resume import ReactorHistory, Span
+from hardware.chibio.resume import NEVER, ReactorHistory, Span
 from hardware.storage.doses import Ending
 
-__all__ = ["conclude", "found"]
+__all__ = ["SAME_S", "conclude", "found"]
 
 SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last request that it heard is not on record
+SAME_S = 1e-3  # on-times that differ by less are one target: a path carries six digits of it
 MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer
 
 
@@ -26,7 +27,7 @@ class _Pump:
 
     asked_s: run time at which it was asked on, inf if it never was. on, off: run times between which it went on and
     off, nan if not known. tried_s: run time at which it was first asked off in vain, nan if it never was. dose_s:
-    on-time as planned.
+    on-time as planned. anew: run time since which somebody else may have switched it on, and the on-time then.
     """
 
     part: str
@@ -36,12 +37,17 @@ class _Pump:
     off: Span
     tried_s: float
     dose_s: float
+    anew: Span
 
-    def on_s(self, now_s: float) -> Span:
-        """Least and most seconds for which it was on; it is off by now."""
+    def on_s(self, now_s: float) -> tuple[float, float, float]:
+        """Least and most seconds for which it was on, and for which it may have been on anew; it is off by now."""
         first, last = (now_s, now_s) if math.isnan(self.off[1]) else self.off
+        most, anew = max(last - self.asked_s, 0.0), 0.0
+        if not math.isnan(since_s := self.anew[0]):
+            first, anew = min(first, since_s), max(now_s - since_s, 0.0)
+            most = min(most, max(since_s - self.asked_s, self.dose_s))
         least = 0.0 if math.isnan(self.on[1]) else max(first - self.on[1] - MOTOR_S, 0.0)
-        return least, max(last - self.asked_s, 0.0)
+        return least, most, anew
 
 
 def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
@@ -49,10 +55,13 @@ def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
     fed_s = known.on_s if known.fed else math.inf
     wasted_s = known.on_s if math.isnan(known.waste_on[0]) else known.waste_on[0]
     return (
-        _Pump("feed", known.feed_pump, fed_s, known.feed_on, known.feed_off, known.feed_tried, known.feed_s),
+        _Pump(
+            "feed", known.feed_pump, fed_s, known.feed_on, known.feed_off, known.feed_tried, known.feed_s,
+            known.feed_anew,
+        ),
         _Pump(
             "waste", WASTE, wasted_s if known.wasted else math.inf, known.waste_on, known.waste_off,
-            known.waste_tried, known.waste_s,
+            known.waste_tried, known.waste_s, known.waste_anew,
         ),
     )  # fmt: skip
 
@@ -63,10 +72,12 @@ def found(
 ) -> dict[str, Span | None]:  # fmt: skip
     """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
 
-    None takes back what was answered and is not so. Nothing is added where the answers have told it. A pump that is
-    found off was switched off by whom and when, in this order: by a restart; by the agent, as it says; by a command of
-    ours whose answer was lost, done at once or when a tunnel delivered it; by the end of its experiment; else it never
-    went on, or an agent that cannot be asked switched it off after our silence.
+    None takes back what was answered and is not so; then it may be on anew, or the look may be an old answer delivered
+    again, so what was answered stays the least. So it is where another target is found than was set. Nothing is added
+    where the answers have told it. A pump that is found off was switched off by whom and when, in this order: by a
+    restart; by the agent, as it says; by a command of ours whose answer was lost, done at once or when a tunnel
+    delivered it; by the end of its experiment; else it never went on, or somebody, or an agent that cannot be asked,
+    switched it off.
 
     Args:
       state: as read at run time now_s. seen_s: run time of the last answer before that.
@@ -85,6 +96,12 @@ def found(
             added[f"{pump.part}_on"] = (asked_s, min(max(asked_s, heard_s), now_s))
         if is_on and (off_heard or not math.isnan(pump.tried_s)):
             added[f"{pump.part}_off"] = None
+        target_s = PERIOD_S * state.pump_targets[PUMPS.index(pump.name)]
+        changed = pump.asked_s <= now_s and not restarted and not abs(target_s - pump.dose_s) <= SAME_S  # also nan
+        if changed and not pump.anew[0] <= asked_s:
+            added[f"{pump.part}_anew"] = asked_s, target_s if target_s > 0.0 else 0.0
+        elif is_on and off_heard and math.isnan(pump.anew[0]):
+            added[f"{pump.part}_anew"] = pump.off[0], pump.dose_s
         if is_on or off_heard:
             continue
         if restarted:  # as a rule that is why it was not heard any more
@@ -95,8 +112,8 @@ def found(
             off = min(pump.tried_s, now_s), now_s
         elif not state.running:
             off = min(seen_s, now_s), now_s
-        elif on_heard and pump.part == "feed" and state.pumps_on[PUMPS.index(WASTE)]:  # an agent ends both
-            off = pump.on[1] + pump.dose_s + MOTOR_S, pump.on[1] + pump.dose_s + MOTOR_S
+        elif on_heard and pump.part == "feed" and seen_s < now_s and state.pumps_on[PUMPS.index(WASTE)]:
+            off = pump.on[1] + pump.dose_s + MOTOR_S, pump.on[1] + pump.dose_s + MOTOR_S  # an agent ends both
         elif not on_heard and not silent:
             off = asked_s, asked_s
         else:
@@ -114,10 +131,14 @@ def conclude(
     Args: now_s: run time at which its pumps were verified off. feed, waste: the two pumps.
     """
     fed, wasted = _pumps(known)
-    least_s, most_s = fed.on_s(now_s)
+    least_s, most_s, anew_s = fed.on_s(now_s)
     low_ml, low_times, low_last_ml = _runs(least_s, fed.dose_s, PERIOD_S + MOTOR_S, feed)
     feed_ml, feed_times, feed_last_ml = _runs(most_s, fed.dose_s, PERIOD_S, feed)
-    waste_ml, waste_times, waste_last_ml = _runs(wasted.on_s(now_s)[1], wasted.dose_s, PERIOD_S, waste)
+    if anew_s > 0.0:  # told as further repetitions, of which the last may be larger
+        once_ml, times, last_ml = _runs(anew_s, fed.anew[1], PERIOD_S, feed)
+        feed_times, feed_last_ml = feed_times + times + 1, max(once_ml * max(times, 1) + last_ml - feed_ml * times, 0.0)
+    waste_s = min(wasted.dose_s, wasted.anew[1])  # the former where the latter is nan
+    waste_ml, waste_times, waste_last_ml = _runs(replace(wasted, anew=NEVER).on_s(now_s)[1], waste_s, PERIOD_S, waste)
     number = 0 if known.feed_pump == FEED else PUMPS.index(known.feed_pump) + 1
     ending = Ending(
         known.on_s, feed_ml, waste_ml, feed_times, waste_times, number, feed_last_ml, waste_last_ml,

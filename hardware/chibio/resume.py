@@ -14,7 +14,7 @@ from hardware.storage.history import History, replayed
 
 __all__ = ["NEVER", "ReactorHistory", "Span", "replay"]
 
-SPANS = {"feed_on", "waste_on", "feed_off", "waste_off"}
+SPANS = {f"{part}_{what}" for part in ("feed", "waste") for what in ("on", "off", "anew")}
 NEVER = (math.nan, math.nan)
 
 Span = tuple[float, float]
@@ -29,7 +29,8 @@ class ReactorHistory(History):
     Of an open dose: feed_s, waste_s are its on-times as planned; feed_pump, which pump feeds; experiment, start_time
       then. feed_on, waste_on, feed_off, waste_off: run times between which that pump went on or off, by the answer to
       its command or by what was found; nan if not known. feed_tried, waste_tried: run time at which it was first asked
-      off without an answer.
+      off without an answer. feed_anew, waste_anew: run time since which it may have been switched on anew by somebody
+      else, and the on-time then; nan if nothing speaks for that.
     """
 
     device_id: str = ""
@@ -46,6 +47,8 @@ class ReactorHistory(History):
     waste_off: Span = NEVER
     feed_tried: float = math.nan
     waste_tried: float = math.nan
+    feed_anew: Span = NEVER
+    waste_anew: Span = NEVER
 
     KINDS: ClassVar = (*History.KINDS, "command", "found", "overflow_pump")
     KEYS: ClassVar = {**History.KEYS, "device_id": str, "blank": float, "start_time": str}
@@ -58,7 +61,7 @@ class ReactorHistory(History):
             return replace(
                 known, experiment=known.start_time, feed_pump=feeds_by(row), feed_on=NEVER,
                 waste_on=NEVER, feed_off=NEVER, waste_off=NEVER, feed_s=feed_s, waste_s=waste_s, feed_tried=math.nan,
-                waste_tried=math.nan,
+                waste_tried=math.nan, feed_anew=NEVER, waste_anew=NEVER,
             )  # fmt: skip
         if kind == "command" and known.open:
             return known._switched(

@@ -7,7 +7,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.protocol import DeviceState
 from hardware.clock import Clock
 
-__all__ = ["Sampling"]
+__all__ = ["FIRST_SAMPLE_S", "Sampling"]
 
 CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record

@@ -15,7 +15,7 @@ from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.onboard_regulation import OnboardRegulation, regulates
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, DeviceState
-from hardware.chibio.sampling import Sampling
+from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.reactor import Fault
 from hardware.stations import Newest
@@ -252,7 +252,10 @@ class Station:
     def _judge(self, state: DeviceState) -> bool:
         """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
+        self.doses.watch(state, ours=not self.regulation.active)
         is_new = self.sampling.look(state, now)
+        if is_new and now < self.doses.stray_s + FIRST_SAMPLE_S:  # measured before or after that, nobody knows
+            self.sampling.key, self.sampling.arrived_s, is_new = (state.sample_s, state.cycles), now, False
         age = 0.0 if is_new else now - self.sampling.arrived_s
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
@@ -340,11 +343,12 @@ class Station:
     def pumps_off(self) -> None:
         """All pumps but the overflow pump off, verified; a dose is over then. Raises: as `Connection.pumps_off`."""
         self.doses.settle()
+        self.doses.drain()
 
     def give_up(self) -> None:
         """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""
         self.regulation.take_back()
-        self.pumps_off()
+        self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
         """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError."""

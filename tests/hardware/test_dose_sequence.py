@@ -126,9 +126,9 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
     bench.line.posts.clear()
     bench.run()
     due = round(1000.0 + WASTE_S + 2.0, 3)  # the device needs its settling time before it is read back
-    assert bench.line.posts[0] == (round(1001.0 + FEED_S + 2.0, 3), OFFS[0])
-    assert [path for _, path in bench.line.posts[1:]] == END
-    assert {t for t, _ in bench.line.posts[1:5]} == {due}
+    assert bench.line.posts[:2] == [(round(1001.0 + FEED_S + 2.0, 3), path) for path in ("/changeDevice/M0", OFFS[0])]
+    assert [path for _, path in bench.line.posts[2:]] == ["/changeDevice/M0", *END]
+    assert {t for t, _ in bench.line.posts[2:7]} == {due}
     assert not bench.doses.running
     assert bench.of("dose_end")[0].items() >= {"verified_off": True, "repeated_ml": 0.0}.items()
     assert bench.book.notes == []
@@ -245,8 +245,8 @@ def test_a_reactor_that_is_gone_is_looked_for_every_half_minute() -> None:
     bench.line.shown = {"presentDevices": {"M0": 0}}
     bench.connection.state = None
     bench.run(100.0)
-    looks = [t for t, path in bench.line.posts if path == "/changeDevice/M0"][1:]
-    assert np.diff(looks).tolist() == pytest.approx([30.0, 30.0, 30.0])
+    looks = {t for t, path in bench.line.posts if path == "/changeDevice/M0" and t > 1000.0}
+    assert np.diff(sorted(looks)).tolist() == pytest.approx([30.0, 30.0, 30.0])
     assert bench.doses.running
     assert bench.doses.stuck == ""
 
@@ -279,7 +279,7 @@ def test_the_feed_is_switched_off_every_two_seconds_until_the_device_has_heard_i
 
     bench.line.trouble = deaf
     bench.run(off_s + 4.1 - bench.clock.now())
-    assert tried == [0.0, 2.0]
+    assert sorted(set(tried)) == [0.0, 2.0]
     assert bench.line.posts[-1] == (round(off_s + 4.0, 3), OFFS[0])
     assert (bench.book.fault is not None) == (not isinstance(error, DeviceStateError))
     bench.run()
@@ -301,7 +301,7 @@ ELSEWHEN = {"Experiment__startTime": "2026-01-01 01:00:00"}
     [
         *(("/", deaf_s, {}, {}, (k, k)) for deaf_s, k in ((60.0, 0), (65.0, 1), (123.0, 1), (128.0, 2))),
         (OFFS[1], 130.0, {}, {}, (0, 2)),  # the feed pump was heard to be off
-        ("-", 0.0, {}, {"Pump1__ON": 1}, (2, 2)),  # it answers off and goes on; the waste pump goes on beside it
+        ("-", 0.0, {}, {"Pump1__ON": 1}, (3, 2)),  # it answers off and goes on, or anew; the waste pump beside it
         ("-", 0.0, ELSEWHEN, {"Pump1__ON": 1}, (0, 0)),  # restarted in the dose
     ],
 )
@@ -384,7 +384,11 @@ def test_what_the_feed_put_off_is_not_given_by_a_supply_pump(supplied):
 
 
 def test_of_two_commands_that_were_given_up_the_newer_is_looked_for(supplied):
-    supplied.line.lost = {"/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump3/1/M0"}
+    def lose(path: str) -> None:
+        if path.startswith("/SetOutputOn") and "/1/" in path and "Pump2" not in path:
+            raise LinkError("no answer")
+
+    supplied.line.trouble = lose
     supplied.begin(0.5 / 60.0)
     supplied.run(60.0)
     supplied.clock.sleep(60.0)

@@ -27,12 +27,14 @@ OPEN = ReactorHistory(
 )  # fmt: skip
 UNHEARD = replace(OPEN, feed_on=(math.nan, math.nan))
 UNFED = replace(UNHEARD, on_s=98.0, fed=False)
+ENDED = replace(OPEN, feed_off=(103.2, 103.3))
 SILENCE_S = 120.0
 
 
 def read(feed: bool, waste: bool, start_time: str = START, **changes: Any) -> DeviceState:
-    found_so = parse_state(json.dumps(state()).encode())
-    return replace(found_so, pumps_on=(feed, waste, False, False), start_time=start_time, cycles=5, **changes)
+    targets = (1.2 / PERIOD_S, 9.0 / PERIOD_S, 1.2 / PERIOD_S, 0.0)
+    found_so = replace(parse_state(json.dumps(state()).encode()), pump_targets=targets)
+    return replace(found_so, pumps_on=(feed, waste, False, False), start_time=start_time, **{"cycles": 5, **changes})
 
 
 def after(
@@ -111,6 +113,7 @@ def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
         # heard and found off: somebody switched it off, nobody knows when; the agent would have ended both pumps
         (OPEN, read(False, False), 130.0, 101.0, {}, 1.2, 0.0),
         (OPEN, read(False, True), 130.0, 101.0, {}, 1.2, 1.2),
+        (OPEN, read(False, True), 103.0, 103.0, {}, 1.2, 0.0),  # and nothing was missed
         # asked off without an answer, and found off: done at once, or when a tunnel delivered it just now
         (replace(OPEN, feed_tried=103.5, waste_tried=111.0), read(False, False), 600.0, 101.0, {}, 9.6, 1.2),
         (replace(OPEN, feed_tried=166.0), read(False, False), 600.0, 101.0, {}, 9.6, 2.4),
@@ -123,9 +126,16 @@ def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
         # never fed
         (UNFED, read(False, True), 1000.0, 98.0, {}, 0.0, 0.0),
         (UNFED, read(False, False), 1000.0, 98.0, {}, 0.0, 0.0),
-        # answered off, and found on: not done
-        (replace(OPEN, feed_off=(103.0, 103.1)), read(True, True), 240.0, 101.0, {}, 3.6, 3.6),
+        # answered off, and found on: an old answer delivered again, not done, or switched on anew by somebody
+        (replace(OPEN, feed_off=(103.0, 103.1)), read(True, True), 240.0, 101.0, {}, 4.8, 1.2),
+        (replace(OPEN, feed_off=(103.0, 103.1)), read(True, True), 103.4, 101.0, {}, 1.6, 1.2),
         (replace(OPEN, feed_off=(103.0, 103.1)), read(False, True), 1000.0, 101.0, {}, 1.2, 1.2),
+        # another target than was set: by somebody, before the dose, in it or after it
+        (OPEN, read(True, True, pump_targets=(0.13 / 63.0, 9.0 / 63.0, 0.0, 0.0)), 110.0, 101.0, {}, 1.33, 0.0),
+        (ENDED, read(False, True, pump_targets=(5.04 / 63.0, 9.0 / 63.0, 0.0, 0.0)), 110.0, 101.0, {}, 6.24, 0.0),
+        (ENDED, read(False, True, pump_targets=(5.04 / 63.0, 9.0 / 63.0, 0.0, 0.0)), 104.0, 101.0, {}, 5.2, 0.0),
+        (ENDED, read(False, True, pump_targets=(math.nan, 9.0 / 63.0, 0.0, 0.0)), 110.0, 101.0, {}, 1.2, 0.0),
+        (UNFED, read(False, True, pump_targets=(0.0, 9.0 / 63.0, 0.0, 0.0)), 1000.0, 98.0, {}, 0.0, 0.0),
         # a device that was restarted forgot its pumps; as a rule that is why it was silent
         (OPEN, read(True, True, "another"), 1000.0, 101.5, {}, 1.2, 0.7),
         (OPEN, read(False, False, " Waiting "), 1000.0, 101.5, {}, 1.2, 0.7),

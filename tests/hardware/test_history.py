@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from hardware.chibio.resume import ReactorHistory, replay
+from hardware.chibio.resume import SPANS, ReactorHistory, replay
 from hardware.errors import RecordingError
 from hardware.pioreactor.doses import replay as units
 from hardware.storage.doses import Ending, Given, dosed
@@ -23,7 +23,7 @@ INTENT = {
 
 def test_nothing_is_known_of_a_reactor_without_rows_and_a_dose_may_have_given_nothing() -> None:
     known = {key: value for key, value in asdict(ReactorHistory()).items() if value == value}  # but for nan
-    spans = {known.pop(key) for key in ("feed_on", "waste_on", "feed_off", "waste_off")}
+    spans = {known.pop(key) for key in sorted(SPANS)}
     assert all(start != start and end != end for start, end in spans)
     assert {key: value for key, value in known.items() if value} == {"feed_pump": "Pump1"}
     assert {value for value in asdict(Ending(10.0)).values() if value == value} == {10.0, 0}

@@ -33,6 +33,7 @@ def fixed(lab: DriverLab, rate: float) -> None:
 def test_three_reactors_are_held_without_a_missed_or_doubled_minute() -> None:
     """Starts lie a third of a minute apart, and each dose between two measurements of its own reactor."""
     lab = begun(("M0", "M1", "M2"), minutes=16)
+    lab.clock.sleep(12.0)  # a dose under way ends
     lab.reactors.stop()
     assert np.all(lab.samples >= 14)
     begins = [t for t, path in lab.wire.posts if path.startswith("/Experiment/1")]

@@ -1,0 +1,157 @@
+"""Doses that this program did not give: from the web page, by a late command, by a target that somebody changed."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hardware.errors import LinkError
+from hardware.link.transport import Reply
+from tests.hardware.driver_lab import DriverLab
+from tests.hardware.test_slow_commands import FALSE_ALARMS, FEED_OFF, FEED_ON, WASTE_ON, check_booked, lab_of
+
+
+def notes(lab: DriverLab, words: str) -> list[str]:
+    return [note for step in lab.steps for note in step.notes if words in note]
+
+
+def check_held(lab: DriverLab) -> None:
+    """The truth lies between what is told at least and what is booked, but for what a motor gives by itself."""
+    lab.run(2)
+    lab.clock.sleep(15.0)
+    true_ml, booked_ml = float(lab.truth()["feed_ml"]), float(lab.loop.interlock.budget.fed_ml[0])
+    doubt_ml = sum(e["feed_ml"] + e["repeated_ml"] - e["feed_low_ml"] for e in lab.of("dose_end"))
+    doubt_ml += sum(given["feed_ml"] - given["feed_low_ml"] for given in lab.of("given"))
+    assert 0.97 * (booked_ml - doubt_ml) <= true_ml <= 1.03 * booked_ml + 0.05
+
+
+def at(lab: DriverLab, after_s: float, *paths: str, pause_s: float = 0.0) -> None:
+    """Let a web page send these commands so long after the next sample, whatever the run does then."""
+
+    def page() -> Iterator[float]:
+        for path in paths:
+            lab.device.handle("POST", path)
+            yield pause_s
+
+    lab.step()
+    lab.reactors._agenda.add(page(), after_s)
+
+
+@pytest.mark.parametrize(("after_s", "times"), [(20.0, 1), (41.0, 1), (53.0, 1), (20.0, 2)])
+def test_a_dose_from_the_web_page_is_booked_drained_and_told_once(after_s: float, times: int) -> None:
+    """Known are its target and when the pump was last seen off; a page that was left open gives it again."""
+    lab = lab_of()
+    for _ in range(times):
+        given = lab.truth()["feed_ml"]
+        at(lab, after_s, "/SetOutputTarget/Pump1/M0/0.08", "/SetOutputOn/Pump1/1/M0")
+        lab.run(3)
+        assert lab.truth()["feed_ml"] > given + 4.0
+    assert lab.truth()["volume_ml"] < 21.0
+    assert len(notes(lab, "Pump1 was used by somebody")) == times
+    if after_s < 50.0:  # else it is cut, and nobody knows when
+        check_booked(lab)
+    check_held(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+    assert "overflow" not in lab.kinds()
+    assert lab.of("intent")[-1]["time_s"] > lab.reactors.elapsed() - 120.0  # it goes on
+
+
+def test_a_dose_from_the_web_page_that_nobody_saw_is_told_by_the_target_that_it_left() -> None:
+    lab = lab_of()
+    page = "/SetOutputTarget/Pump1/M0/0.04", "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0"
+    at(lab, 22.0, *page, pause_s=1.5)
+    lab.run(3)
+    assert len(notes(lab, "Pump1 was used by somebody, at a target of 0.04: 0.00 to 2.62 mL")) == 1
+    check_held(lab)
+
+
+@pytest.mark.parametrize(
+    ("when", "after_s", "path", "told"),
+    [
+        (WASTE_ON, 0.0, "/SetOutputTarget/Pump1/M0/0.002", True),  # it was read back already
+        (FEED_ON, 0.2, "/SetOutputTarget/Pump1/M0/0.002", True),
+        (FEED_ON, 0.6, "/SetOutputTarget/Pump1/M0/0.03", True),
+        (FEED_ON, 0.6, "/SetOutputTarget/Pump1/M0/nan", True),
+        (FEED_ON, 0.5, "/SetOutputOn/Pump1/0/M0", True),
+        (FEED_OFF, 0.5, "/SetOutputOn/Pump1/1/M0", True),
+        (FEED_OFF, 0.5, "/SetOutputTarget/Pump1/M0/0.03", True),
+        (FEED_ON, 0.5, "/SetOutputTarget/Pump2/M0/0.5", False),  # more of the waste harms nothing
+    ],
+)
+def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an_interval(
+    when: str, after_s: float, path: str, told: bool
+) -> None:
+    lab = lab_of(rate=1.04 / 60.0)
+    left = [1]
+
+    def page() -> Iterator[float]:
+        lab.device.handle("POST", path)
+        yield from ()
+
+    def post(asked: str, real: Any) -> Reply:
+        reply: Reply = real(asked)
+        if asked.startswith(when) and left:
+            left.clear()
+            lab.reactors._agenda.add(page(), after_s)
+            if when == WASTE_ON:
+                lab.reactors._agenda.run_due()
+        return reply
+
+    lab.on_post(post)
+    lab.run(4)
+    assert bool(notes(lab, "gave 0.00 to") or notes(lab, "gave 1.04 to") or notes(lab, "was repeated")) == told
+    check_held(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+
+
+@pytest.mark.parametrize("landing", [(FEED_ON, 0.4), (FEED_ON, 1.0), (FEED_OFF, 0.3), (FEED_OFF, 4.0)])
+def test_a_feed_command_that_is_heard_in_a_later_dose_is_told_with_what_that_may_have_given(
+    landing: tuple[str, float],
+) -> None:
+    lab = lab_of(rate=0.62 / 60.0)
+    kept = [1]
+
+    def arrives() -> Iterator[float]:
+        lab.device.handle("POST", f"{FEED_ON}M0")
+        yield from ()
+
+    def post(path: str, real: Any) -> Reply:
+        if path.startswith(FEED_ON) and kept[-1] == 1:
+            kept.append(2)
+            lab.clock.sleep(20.0)
+            raise LinkError("no answer")
+        if path.startswith(landing[0]) and kept[-1] == 2 and lab.of("dose_end")[-1]["feed_ml"] == 0.0:
+            kept.append(3)
+            lab.reactors._agenda.add(arrives(), landing[1])
+        return real(path)
+
+    lab.on_post(post)
+    lab.run(5)
+    assert kept[-1] == 3
+    told = notes(lab, "0.62 to 1.24 mL, booked as the former: a feed command that was given up")
+    assert told or notes(lab, "on again, in a dose") or notes(lab, "heard late")
+    lab.run(2)
+    lab.clock.sleep(15.0)
+    booked_ml = float(lab.loop.interlock.budget.fed_ml[0])
+    assert booked_ml - 0.65 <= lab.truth()["feed_ml"] <= 1.03 * booked_ml + 0.65
+    assert not FALSE_ALARMS & lab.kinds()
+
+
+@pytest.mark.parametrize(("since", "seconds"), [(FEED_ON, 9.0), (FEED_ON, 30.0), (FEED_ON, 80.0), (WASTE_ON, 40.0)])
+def test_an_old_answer_delivered_again_does_not_become_the_least_that_was_given(since: str, seconds: float) -> None:
+    """What was answered to a command stays true, whatever a look says."""
+    lab = lab_of(rate=0.61 / 60.0)
+    post, get, old = lab.wire.inner.post, lab.wire.inner.get, list[tuple[float, Reply]]()
+
+    def switch(path: str) -> Reply:
+        reply = post(path)
+        if path.startswith(since) and not old:
+            old.append((lab.clock.now(), get("/getSysdata/")))
+        return reply
+
+    def cached(path: str) -> Reply:
+        return old[0][1] if old and lab.clock.now() < old[0][0] + seconds else get(path)
+
+    lab.wire.inner.post, lab.wire.inner.get = switch, cached  # type: ignore[method-assign]
+    lab.run(6)
+    check_held(lab)
