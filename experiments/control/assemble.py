@@ -40,7 +40,7 @@ from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import Light, Share, program_of
 from experiments.loop.signals import Signal
 from experiments.record.record import Record
-from experiments.record.recovery import COLUMNS, continue_loop
+from experiments.record.recovery import COLUMNS, continue_loop, is_over
 from hardware.errors import ReactorError, UnfitError
 from hardware.family import Family, Opening, family_of, report
 from hardware.reactor import Reactor
@@ -372,6 +372,9 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
     """Open the loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
+    if setup.resumed and is_over(record.journal, record.state_path):
+        remedy = "nothing was done to the device; start a new run"
+        raise frame.UserError(f"resume={record.folder}: the run is over, its pumps were verified off; {remedy}")
     opening = Opening(setup.backend, setup.bench, setup.plant, record.journal, record.folder, setup.resumed)
     with setup.family.open(opening) as reactors:
         try:

@@ -28,6 +28,8 @@ __all__ = ["Record", "Table"]
 
 log = logging.getLogger(__name__)
 
+AFTERWARDS = "resume=RUN writes it anew from them once the run has ended"
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -76,7 +78,7 @@ class Record:
         paths = [self.folder / "recordings" / f"{name}.csv" for name in self.names]
         self._recorders = [Recorder(path, columns, self._fsync, REBUILD) for path in paths]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
-        self._paths, self.columns = paths, tuple(columns)
+        self._paths, self.columns, self._gone = paths, tuple(columns), set[Path]()
         self.rows = [read_rows(path, columns) for path in paths]
         self.repairs += self._completed(self.journal.rows)
         began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
@@ -125,6 +127,9 @@ class Record:
         """Write a step's rows, the state after it, and its curves. Raises: RecordingError when the disk refuses."""
         for n in map(int, np.flatnonzero(step.rows)):
             self._write(n, row_of(step, n))
+            if (path := self._paths[n]) not in self._gone and self._recorders[n].gone:
+                self._gone.add(path)
+                log.warning("%s: deleted or moved in the run; the journal has its rows: %s", path, AFTERWARDS)
         try:
             self.curves.step(step)
             if self._fsync:

@@ -27,7 +27,7 @@ from hardware.storage.doses import dosed
 from hardware.storage.journal import REMEDY, Journal
 
 __all__ = [
-    "COLUMNS", "REBUILD", "Row", "at_end", "complete", "continue_loop", "load_state", "read_rows", "row_of",
+    "COLUMNS", "REBUILD", "Row", "at_end", "complete", "continue_loop", "is_over", "load_state", "read_rows", "row_of",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
@@ -236,6 +236,18 @@ def load_state(path: Path) -> dict[str, Any]:
 def _no_state(path: Path, why: str) -> RecordingError:
     remedy = "journal and recordings are kept; start a new run, or put back the file as the run wrote it"
     return RecordingError(f"{path}: no state to resume from ({why}); {remedy}")
+
+
+def is_over(journal: Journal, path: Path) -> bool:
+    """Whether every reactor of a run was done or given up, and its pumps verified off since.
+
+    Args: path: of state.json. Raises: RecordingError.
+    """
+    state, ends = load_state(path), [row for row in journal.rows if row["kind"] in ("start", "stop")]
+    done, stopped = (state.get(key) for key in ("done", "stopped"))
+    if not (ends and ends[-1]["kind"] == "stop" and not ends[-1].get("not_verified")):
+        return False
+    return isinstance(done, list) and isinstance(stopped, list) and bool(np.logical_or(done, stopped).all())
 
 
 def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence[Rows] = ()) -> None:

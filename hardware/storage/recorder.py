@@ -72,6 +72,11 @@ class Recorder:
         os.ftruncate(self._fd, content.rstrip(b"\n").rfind(b"\n") + 1)
         self.write(row)
 
+    @property
+    def gone(self) -> bool:
+        """Whether the file was deleted or moved since it was opened."""
+        return not (self.path.exists() and os.path.samestat(self.path.stat(), os.fstat(self._fd)))
+
     def close(self) -> None:
         """Close the file. Idempotent."""
         if self._fd >= 0:

@@ -2,11 +2,15 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control import assemble
 from experiments.control.config import DeployConfig
+from experiments.record.record import Record
 from hardware.emulator.faults import inject
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
@@ -77,6 +81,27 @@ def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path)
     for _ in run.run():
         pass
     assert run.reactors.handed_over.tolist() == [True]
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_run_that_is_over_is_not_taken_to_the_device_again_once_its_pumps_were_verified_off(
+    tmp_path: Path, stopped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,)))
+    run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    if stopped:
+        run.reactors.stop()
+    run.close()
+    setup = assemble.unpack(replace(config, resume=str(tmp_path)), tmp_path)
+    record = Record(tmp_path, run.names, setup.fsync, setup.columns)
+    tried = ConnectionError("the device was asked")
+    monkeypatch.setattr(setup.family, "open", Mock(side_effect=tried))
+    with pytest.raises(frame.UserError if stopped else ConnectionError, match="is over" if stopped else "was asked"):
+        assemble.opened(setup, record).__enter__()
+    record.close()
 
 
 def test_a_word_that_is_none_of_them_is_refused() -> None:

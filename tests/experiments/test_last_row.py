@@ -50,12 +50,19 @@ def test_a_run_that_is_under_way_is_left_as_it_is(tmp_path: Path) -> None:
     Record(tmp_path, ("M0",), fsync=False).close()
 
 
-def test_a_recording_that_is_deleted_in_a_run_is_one_line_at_its_end(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["deleted", "moved"])
+def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_its_end(
+    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
     run = in_a_dose(tmp_path, "M0")
-    rows = len(run.record.rows[0])
     (path,) = (tmp_path / "recordings").glob("*.csv")
-    path.unlink()
+    assert caplog.text == ""
+    path.unlink() if how == "deleted" else path.rename(tmp_path / "elsewhere")
+    for _ in run.run(run.clock.now() + 150.0):
+        pass
+    assert caplog.text.count(f"{path}: deleted or moved in the run") == 1
     run.reactors.stop()
+    rows = len(run.record.rows[0])
     with pytest.raises(RecordingError, match=r"M0\.csv"):
         run.record.complete()
     assert len(run.record.rows[0]) == rows  # for figure and summary
