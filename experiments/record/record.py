@@ -28,7 +28,7 @@ __all__ = ["Record", "Table"]
 
 log = logging.getLogger(__name__)
 
-AFTERWARDS = "resume=RUN writes it anew from them once the run has ended"
+AFTERWARDS = "resume=RUN writes it anew from the journal once the run has ended"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class Record:
             self._write(n, row_of(step, n))
             if (path := self._paths[n]) not in self._gone and self._recorders[n].gone:
                 self._gone.add(path)
-                log.warning("%s: deleted or moved in the run; the journal has its rows: %s", path, AFTERWARDS)
+                log.warning("%s: deleted or moved in the run; %s", path, AFTERWARDS)
         try:
             self.curves.step(step)
             if self._fsync:

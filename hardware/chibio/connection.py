@@ -192,12 +192,14 @@ class Connection:
                 self.read()  # presence first
             error: ReactorError | None = None
             refused: ProtocolError | None = None
+            left = list(pumps)
             silent = 0  # time-outs are long: after two in a row, fail instead of trying the others
             for pump in sorted(pumps, key=WASTE.__eq__):
                 if pump == WASTE and (error or refused):
                     break  # a feed pump may run
                 try:
                     self.switch(pump, False)
+                    left.remove(pump)
                     silent = 0
                 except ProtocolError as failed:
                     refused = failed
@@ -223,7 +225,9 @@ class Connection:
             named = ", ".join(pump for pump in on if pump != WASTE or on == [WASTE])
             error = DeviceStateError(f"{self.name}: {named} still on after the off command{why}")
         assert error is not None
-        raise error
+        if isinstance(error, DeviceStateError):
+            raise error
+        raise type(error)(f"{', '.join(left or pumps)} not verified off: {error}")
 
     def drain(self) -> None:
         """Waste pump on, where a feed pump may run or has run without it. Raises: as `post`."""

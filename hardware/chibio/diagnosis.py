@@ -13,7 +13,7 @@ __all__ = ["diagnose", "fault_of"]
 
 def diagnose(
     state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
-    dosing: bool, stuck: str, ended: str, overflow_trouble: str, late: str = "",
+    dosing: bool, stuck: str, ended: str, overflow_trouble: str,
 ) -> Fault | None:  # fmt: skip
     """Find the gravest fault that a verified state shows, against how the reactor should be found.
 
@@ -23,7 +23,6 @@ def diagnose(
       dosing: its pumps may be on. stuck: why its pumps could not be verified off, "" if they were.
       ended: why this program ended its experiment, "" if it did not.
       overflow_trouble: why its overflow pump could not be verified on, "" if it was.
-      late: pump whose command was given up for want of an answer, and may still be carried out; "" if there is none.
     """
     if state.start_time != start_time or not state.started:
         return Fault(
@@ -42,10 +41,8 @@ def diagnose(
         return Fault("pump", stuck, "switch the pump board off by hand")
     handed_over = math.isfinite(setpoint)
     on = config.overflow_pump.others_on(state)
-    if on and on == late and not dosing:
-        return Fault("pump", f"pumps on: {on}, by a command of this program that was heard late", "check the link")
     if on and not dosing and not handed_over:
-        return Fault("pump", f"pumps on: {on}, not by this program", "close the device's web page everywhere")
+        return Fault("pump", f"pumps on: {on}, and no dose has them", "close the device's web page everywhere")
     if state.pumping_modes or (not regulates(state, setpoint) if handed_over else state.regulating):
         what = ", ".join(state.pumping_modes) or describe(state)
         return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")

@@ -95,12 +95,9 @@ class DoseSequence:
         """Whether a dose is past its end and what it gave is not known yet: a sample waits for that a little."""
         return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
 
-    @property
-    def late(self) -> str:
-        """The pump whose command was given up and may still be carried out, "" if there is none."""
-        now_s = self._book.elapsed()
-        self._given_up = {pump: at_s for pump, at_s in self._given_up.items() if now_s < at_s + LATE_S}
-        return next(reversed(self._given_up), "")
+    def _may_be_late(self, pump: str) -> bool:
+        """Whether a command to this pump was given up and may still be carried out."""
+        return self._book.elapsed() < self._given_up.get(pump, -math.inf) + LATE_S
 
     def begin(
         self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
@@ -186,7 +183,7 @@ class DoseSequence:
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             self._in_doubt()
             self._book.tell(
-                f"the answer to the feed pump's command was lost, what it did is looked for: {error}" if fed
+                f"the command to {plan.pump} was lost or refused, what it did is looked for: {error}" if fed
                 else f"no dose: {error}"
             )  # fmt: skip
         finally:
@@ -344,17 +341,16 @@ class DoseSequence:
         self._book.log("dose_end", **ending.row())
         booked_ml = known.feed_ml if known.fed else 0.0
         self.extra += ending.beyond(booked_ml)
-        if known.fed and known.feed_pump in (self.late, *self._given_up) and not note:
+        if known.fed and self._may_be_late(known.feed_pump) and not note:
             twice = f"{ending.feed_ml:.2f} to {2.0 * ending.feed_ml:.2f} mL, booked as the former"
             self._book.tell(f"a dose gave {twice}: a feed command that was given up may have been heard in it")
         if known.fed and math.isnan(known.feed_on[1]):
-            self._given_up.pop(known.feed_pump, None)
             self._given_up[known.feed_pump] = known.on_s
 
     def _book_stray(self, pump: str, target: float, off_s: float, seen_s: float) -> None:
         """Book what a pump gave that no dose had. Args: it was off at off_s, and seen on at seen_s, nan if never."""
         self.stray_s = self._clock.now()
-        known, late = self._past(), pump in (self.late, *self._given_up)
+        known, late = self._past(), self._may_be_late(pump)
         dose_s = PERIOD_S * target if target > 0.0 else 0.0
         if known.feed_pump == pump and abs(dose_s - known.feed_s) <= SAME_S:
             seen_s = math.nan  # an old answer, delivered again, looks the same

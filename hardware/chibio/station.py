@@ -14,7 +14,7 @@ from hardware.chibio.dosing import DosePlan
 from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.onboard_regulation import OnboardRegulation, regulates
 from hardware.chibio.overflow_pump import OverflowPump
-from hardware.chibio.protocol import FEED, DeviceState
+from hardware.chibio.protocol import FEED, PUMPS, DeviceState
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.reactor import Fault
@@ -48,6 +48,7 @@ class Station:
         self.fluorescence = Fluorescence(connection, config.fluorescence, book)
         self.busy = self.restored = False
         self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
+        self._spoilt: tuple[str, ...] = ()  # pumps that were no number at the last look
         self._ended = ""  # why this program ended the experiment, "" once it runs again
         self._target_c = config.temperature
         self._heat = True
@@ -253,6 +254,7 @@ class Station:
         """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
         self.doses.watch(state, ours=not self.regulation.active)
+        self._unspoil(state)
         is_new = self.sampling.look(state, now)
         if is_new and now < self.doses.stray_s + FIRST_SAMPLE_S:  # measured before or after that, nobody knows
             self.sampling.key, self.sampling.arrived_s, is_new = (state.sample_s, state.cycles), now, False
@@ -260,7 +262,7 @@ class Station:
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
             setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
-            ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble, late=self.doses.late,
+            ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip
         self.book.report(fault)
         if state.running and not self.doses.running:
@@ -316,6 +318,16 @@ class Station:
         for item, on, needed in (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, stir > 0.0)):
             if needed and not on:
                 self._mend(f"{item} was off", "switched on again", connection.switch, item, True)
+
+    def _unspoil(self, state: DeviceState) -> None:
+        """Set a pump's target to a number again, before the device keeps it on record; tell what it has there."""
+        for pump in state.spoilt:
+            if math.isnan(state.pump_targets[PUMPS.index(pump)]):
+                self._mend(f"{pump} was set to no number by somebody", "set to 0", self.connection.target, pump, 0.0)
+            elif pump not in self._spoilt:
+                what = "set to no number by somebody, and measuring will end at the device's next dump"
+                self.book.tell(f"{pump} was {what}: restart the device's software, the run goes on then")
+        self._spoilt = state.spoilt
 
     def _mend(self, found: str, done: str, request: Callable[[str, Any], None], item: str, value: float) -> None:
         try:

@@ -149,13 +149,9 @@ class Experiment:
 
     def _regulate(self) -> Steps:
         """`RegulateOD`: the on-board turbidostat (docs/device.md, Regulation)."""
-        data, od, cycles = self._position.data, self._position.data["OD"], self._position.data["Experiment"]["cycles"]
-        restore = od["target"]
+        data, cycles = self._position.data, self._position.data["Experiment"]["cycles"]
         if data["Volume"]["target"] == 0:
             raise AppError("division by a volume of 0")
-        swinging = data["Zigzag"]["ON"] == 1
-        if swinging:
-            _zigzag(data)
         feed = 0.0 if cycles < 3 or len(data["time"]["record"]) < 2 else _feed_duty(data)
         feed = min(max(feed, 0.0), FEED_CAP)
         if data["Chemostat"]["ON"] == 1:
@@ -168,8 +164,6 @@ class Experiment:
             data["Pump1"]["target"] = data["Pump2"]["target"] = 0.0
         yield from self._outputs.set_on("Pump1", 1)
         yield from self._outputs.set_on("Pump2", 1)
-        if swinging:
-            od["target"] = restore
 
 
 def _feed_duty(data: SysData) -> float:
@@ -194,26 +188,3 @@ def _feed_duty(data: SysData) -> float:
         od["Integral2"] += 0.01 * error
         feed *= 0.7
     return 0.0 if change > 0.04 else float(feed + od["Integral"] + od["Integral2"])
-
-
-def _zigzag(data: SysData) -> None:
-    """Swing OD.target about its centre; estimate growth (1/h) while nothing is pumped.
-
-    Raises: AppError for an OD of 0 or less, of which the device takes the logarithm.
-    """
-    state = data["Zigzag"]
-    centre, now, zig = data["OD"]["target"], data["OD"]["current"], state["Zig"]
-    cycles = data["Experiment"]["cycles"]
-    last = data["OD"]["record"][-1] if data["OD"]["record"] else now
-    if now < centre - zig and last < centre:
-        if state["target"] != 5.0:
-            state["SwitchPoint"] = cycles
-        state["target"] = 5.0
-    elif now > centre + zig and last > centre + zig:
-        state["target"], state["SwitchPoint"] = centre - 1.5 * zig, cycles
-    data["OD"]["target"] = state["target"]
-    if cycles > 6 and cycles - state["SwitchPoint"] > 5:
-        if not (now > 0 and last > 0):
-            raise AppError("logarithm of an OD of 0 or less")
-        growth = 60.0 * math.log(now / last)
-        data["GrowthRate"]["current"] = 0.95 * data["GrowthRate"]["current"] + 0.05 * growth

@@ -120,10 +120,7 @@ class Outputs:
         elif item == "OD":
             yield from self.set_on("Pump1", 0)
             yield from self.set_on("Pump2", 0)
-        elif item == "Zigzag":
-            output["target"] = 5.0
-            output["SwitchPoint"] = self._position.data["Experiment"]["cycles"]
-        else:
+        elif item != "Zigzag":
             raise AppError(f"{item} is no output")
 
     def _stir(self) -> Steps:

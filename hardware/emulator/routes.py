@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 from hardware.emulator.computer import Steps
 from hardware.emulator.software import Software
-from hardware.emulator.sysdata import ALL_REACTORS, SysData, add_terminal, clear_terminal
+from hardware.emulator.sysdata import ALL_REACTORS, clear_terminal
 
 __all__ = ["HTML", "Exchange", "answer_request", "find_route"]
 
@@ -95,26 +95,11 @@ def _reset(s: Software) -> Steps:
         yield LONG_ROUTE_S
 
 
-def _toggle(entry: SysData, **fields: str) -> None:
+def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> None:
+    entry = s.apps[s.selected].data[slot]
     entry["ON"] = int(entry["ON"] != 1)
     if entry["ON"]:
-        entry.update(fields)
-
-
-def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> None:
-    _toggle(s.apps[s.selected].data[slot], LED=led, BaseBand=base, Emit1Band=emit1, Emit2Band=emit2, Gain=gain)
-
-
-def _set_custom(s: Software, program: str, status: str) -> None:
-    data = s.apps[s.selected].data["Custom"]
-    data["ON"] = int(data["ON"] != 1)
-    if data["ON"]:
-        data.update({"Program": program, "Status": float(status), "param1": 0.0, "param2": 0.0, "param3": 0.0})
-
-
-def _characterise(s: Software, m: str, program: str) -> None:
-    """Its thread dies with a TypeError for M0 to M7; with 0 it would sweep LEDs for minutes."""
-    add_terminal(s.app(m).data, s.computer.stamp(), f"Characterisation {program} requested")
+        entry.update(LED=led, BaseBand=base, Emit1Band=emit1, Emit2Band=emit2, Gain=gain)
 
 
 ROUTES = (
@@ -134,9 +119,6 @@ ROUTES = (
     Route("POST", "/ExperimentReset", _reset),
     Route("POST", "/ClearTerminal/*", lambda s, m: clear_terminal(s.app(m).data, s.computer.stamp())),
     Route("POST", "/SetFPMeasurement/*/*/*/*/*/*", _set_fp),
-    Route("POST", "/SetCustom/*/*", _set_custom),
-    Route("POST", "/SetLightActuation/*", lambda s, led: _toggle(s.apps[s.selected].data["Light"], Excite=led)),
-    Route("POST", "/CharacteriseDevice/*/*", _characterise),
 )
 
 

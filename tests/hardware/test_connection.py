@@ -89,11 +89,15 @@ CASES: dict[str, tuple[Steps, list[Act]]] = {
     ),
     "a hung bus is not verified off whatever the flags say": (
         [*read(state()), *posts(*OFF), (f"POST {PROBE}", LOST)],
-        [READ, (LinkError, "no answer", "pumps_off", 1)],
+        [READ, (LinkError, "^Pump1, Pump2, Pump3, Pump4 not verified off: no answer", "pumps_off", 1)],
     ),
     "a dead link: given up after two time-outs until the next try": (
         [*read(state()), (f"POST {OFF[0]}", LOST), (LOOK, LOST)],
         [READ, (LinkError, "no answer", "pumps_off", 1)],
+    ),
+    "one command that is lost: its pump is named, and the waste pump that waits for it": (
+        [*read(state()), *posts(OFF[0]), (f"POST {OFF[1]}", LOST), HERE, *posts(OFF[2])],
+        [READ, (LinkError, "^Pump2, Pump3 not verified off: no answer", "pumps_off", 1)],
     ),
     "a command outside the limits": (
         read(state()),

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.hardware.emulator_lab import Lab, quiet
+from tests.hardware.emulator_lab import Lab
 
 
 def regulate(lab: Lab, target: float) -> None:
@@ -124,18 +124,3 @@ def test_bang_bang_through_the_turbidostat() -> None:
     lab.post("/SetOutputTarget/OD/M0/10")
     after_regulation(lab, 8)
     assert lab.peek()["Pump1"]["target"] == 0.0
-
-
-def test_zigzag_swings_between_grow_and_dilute_and_estimates_growth() -> None:
-    lab = Lab(od=0.5, mu=0.03, blanked=True, options=quiet(mu=0.03))
-    regulate(lab, 0.5)
-    lab.post("/SetOutputOn/Zigzag/1/M0")
-    targets = set()
-    for _ in range(180):
-        lab.wait(60.07)
-        targets.add(round(lab.peek()["Zigzag"]["target"], 3))
-    data = lab.state()
-    assert targets == {5.0, 0.44}  # grow, or centre - 1.5 * 0.04
-    assert data["OD"]["target"] == 0.5
-    assert data["GrowthRate"]["current"] == pytest.approx(60 * 0.03, rel=0.15)
-    assert data["GrowthRate"]["record"][-1] == data["GrowthRate"]["current"]

@@ -22,8 +22,7 @@ ANSWERS = {  # by method and status
         /SetOutputTarget/Pump1/0/0.02 /SetOutputOn/Pump1/0/M0 /SetOutputOn/Zigzag/1/M0 /Direction/Pump1/M0
         /MeasureOD/M0 /CalibrateOD/OD0/M0/14000/0 /CalibrateOD/OD/M0/14000/0 /MeasureTemp/IR/M0 /MeasureFP/M0
         /GetSpectrum/x4/M0 /Experiment/0/M0 /ExperimentReset /ClearTerminal/M0
-        /SetFPMeasurement/FP1/LEDB/CLEAR/nm510/nm550/x10 /SetCustom/C1/0 /SetLightActuation/LEDD
-        /CharacteriseDevice/M0/C1 /SetOutputTarget/Pump1/M0/0%2e02""",
+        /SetFPMeasurement/FP1/LEDB/CLEAR/nm510/nm550/x10 /SetOutputTarget/Pump1/M0/0%2e02""",
     ("GET", 308): "/getSysdata",
     ("POST", 308): "//changeDevice//M0",
     ("POST", 404): """

@@ -177,7 +177,6 @@ def test_a_feed_command_that_is_heard_after_it_was_given_up_is_booked_and_the_li
     assert not FALSE_ALARMS & lab.kinds()
     said = [note for step in lab.steps for note in step.notes]
     assert any("was given up was heard late" in note for note in said)
-    assert not any("not by this program" in (reason or "") for step in lab.steps for reason in step.reasons)
 
 
 @pytest.mark.parametrize(("seconds", "fails"), [(15.0, False), (20.0, True)], ids=["slow", "silent"])

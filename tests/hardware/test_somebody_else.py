@@ -1,5 +1,6 @@
 """Doses that this program did not give: from the web page, by a late command, by a target that somebody changed."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -154,4 +155,23 @@ def test_an_old_answer_delivered_again_does_not_become_the_least_that_was_given(
 
     lab.wire.inner.post, lab.wire.inner.get = switch, cached  # type: ignore[method-assign]
     lab.run(6)
+    check_held(lab)
+
+
+@pytest.mark.parametrize(
+    ("pump", "after_s", "recorded"), [("Pump1", 20.0, False), ("Pump3", 20.0, False), ("Pump4", 52.0, True)]
+)
+def test_a_target_that_is_no_number_is_told_and_mended_before_it_costs_a_sample(
+    pump: str, after_s: float, recorded: bool
+) -> None:
+    """Once it is on record the device's thread ends at its next dump, for good."""
+    lab = lab_of()
+    if recorded:
+        lab.device.apps["M0"].data[pump]["record"].append(math.nan)
+    at(lab, after_s, f"/SetOutputTarget/{pump}/M0/nan")
+    lab.run(3)
+    assert len(notes(lab, f"{pump} was set to no number by somebody and was set to 0")) == 1
+    assert len(notes(lab, "restart the device's software")) == recorded
+    assert lab.device.apps["M0"].data[pump]["target"] == (0.0 if pump != "Pump1" else pytest.approx(0.0086, abs=1e-3))
+    assert lab.of("fault") == []
     check_held(lab)
