@@ -1,7 +1,7 @@
 """Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`.
 
 A level that was read off a vial is more: the run under way sets its ledger to it. So is a share of two species that was
-counted in a sample: the run under way estimates with it.
+counted in a sample: the run under way estimates with it. So is a bottle that was filled: the run doses on from it.
 """
 
 from dataclasses import dataclass
@@ -37,6 +37,9 @@ class MarkConfig:
         None, "of the second species, counted in a sample: a run under way estimates with it", above=0.0, below=1.0
     )
     sd: float | None = setting(None, "of that share; null: 0.03", within=(0.001, 0.5))
+    bottle_ml: float | None = setting(
+        None, "what its bottle was filled to: a run under way doses on from it", "mL", within=(1, 100_000)
+    )
     minute: float | None = setting(
         None,
         "of the run at which it happened, or the sample was drawn; null: now",
@@ -53,10 +56,12 @@ class MarkConfig:
             "1 to 80 characters, one line",
         )
         require(self.sd is None or self.share is not None, "sd", self.sd, "null, or beside share=SHARE")
-        if self.level_ml is not None or self.share is not None:
-            require(
-                bool(self.reactor), "reactor", repr(self.reactor), "the one in which level_ml or share was measured"
-            )
+        measured = [key for key in ("level_ml", "share", "bottle_ml") if getattr(self, key) is not None]
+        if measured:
+            require(bool(self.reactor), "reactor", repr(self.reactor), f"the one that {measured[0]} is of")
+        if self.bottle_ml is not None:
+            require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone: mark them one after the other")
+            require(self.minute is None, "minute", self.minute, "null with bottle_ml: a bottle is of now")
         if self.level_ml is not None:
             require(self.share is None, "share", self.share, "null beside level_ml: mark them one after the other")
             require(self.minute is None, "minute", self.minute, "null with level_ml: a level is of now")
@@ -107,10 +112,11 @@ def mark(config: MarkConfig) -> str:
             raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; nobody has drawn that sample yet")
         said = [f"level {config.level_ml:g} mL"] if config.level_ml is not None else []
         sd = None if config.share is None else USUAL_SD if config.sd is None else config.sd
+        said += [f"bottle {config.bottle_ml:g} mL"] if config.bottle_ml is not None else []
         said += [f"share {config.share:g} +- {sd:g}"] if config.share is not None else []
         own = [config.text] if config.text != MarkConfig.text or not said else []
         text = ", ".join([*said, *own])[:LONGEST]
-        path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd))
+        path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd, config.bottle_ml))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
     taken = "; a run under way takes it over with its next sample, and says so" if said else ""

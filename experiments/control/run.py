@@ -42,7 +42,7 @@ class BenchMarks:
 
     def __init__(self, record: Record) -> None:
         self._record, self._size = record, -1
-        self._taken = sum(row["kind"] in ("level", "share") for row in record.journal.rows)
+        self._taken = sum(row["kind"] in ("level", "share", "bottle") for row in record.journal.rows)
 
     def take(self, loop: ClosedLoop) -> None:
         """Tell the loop what was marked since the last call; a damaged file of marks is only reported.
@@ -70,6 +70,11 @@ class BenchMarks:
             if known:
                 before = loop.set_level(mark.reactor, mark.level_ml)
                 log.info("%s: %.1f mL in the vial by its mark, %.1f by the ledger", mark.reactor, mark.level_ml, before)
+        if mark.bottle_ml is not None:
+            journal.append("bottle", {"reactor": mark.reactor, "bottle_ml": mark.bottle_ml})
+            if known:
+                loop.refilled(mark.reactor, mark.bottle_ml)
+                log.info("%s: %.0f mL in the bottle by its mark; doses go on", mark.reactor, mark.bottle_ml)
         if mark.share is not None and mark.sd is not None:
             counted = {"share": mark.share, "sd": mark.sd, "minute": mark.time_min}
             journal.append("share", {"reactor": mark.reactor, **counted})

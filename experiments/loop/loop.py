@@ -224,6 +224,10 @@ class ClosedLoop:
             self.reactors.set_level(n, level_ml)
         return before
 
+    def refilled(self, name: str, bottle_ml: float) -> None:
+        """Go on with a bottle that was filled to so much."""
+        self.interlock.refilled(self.reactors.names.index(name), bottle_ml)
+
     def counted(self, name: str, share: float, sd: float, minute: float) -> Answer:
         """Take a share counted in a sample of a reactor, drawn at a minute of the run; return what came of it."""
         for signal in self.signals:

@@ -269,12 +269,13 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
     decided, written = (
         {r["reactor"]: r["n"] for r in journal.rows if r["kind"] in kinds} for kinds in (KEPT[:1], KEPT)
     )
-    marked = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]
+    marked = [row for row in journal.rows if row["kind"] in ("level", "bottle") and row["n"] >= state["journal_row"]]
     for dose in [*doses, None]:
         while marked and (dose is None or marked[0]["n"] < dose.n):
             told = marked.pop(0)
             if told["reactor"] in loop.reactors.names:
-                loop.set_level(told["reactor"], float(told["level_ml"]))
+                act = loop.set_level if told["kind"] == "level" else loop.refilled
+                act(told["reactor"], float(told[f"{told['kind']}_ml"]))
         if dose is None:
             break
         mine = np.array([name == dose.reactor for name in loop.reactors.names])

@@ -17,16 +17,20 @@ class FeedBudget:
 
     Args: bench: period and largest rate. tube_ml, full_ml: level that the waste tube keeps, and more than which is an
       overflow, mL, shape (N,).
-    Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
+    Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; bottle_ml, what the bottles hold for
+      the whole run; all of shape (N,).
     """
 
-    remembers = ("volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_paid_ml", "_unusable")
+    remembers = (
+        "volume_ml", "fed_ml", "bottle_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_paid_ml",
+        "_unusable",
+    )  # fmt: skip
 
     def __init__(self, config: SafetyConfig, bench: Bench, tube_ml: Array, full_ml: Array) -> None:
         self._config, self._bench, n = config, bench, len(tube_ml)
         self._tube_ml, self._full_ml = tube_ml, full_ml
         self.volume_ml = self._tube_ml.copy()
-        self.fed_ml = np.zeros(n)
+        self.fed_ml, self.bottle_ml = np.zeros(n), np.full(n, bench.bottle_ml)
         self._hour = np.zeros((n, 60))  # feed per minute of the hour
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
         self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
@@ -69,7 +73,7 @@ class FeedBudget:
         left = [per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
         return {
             "budget": np.minimum.reduce(left),
-            "bottle": self._bench.bottle_ml - self.fed_ml,
+            "bottle": self.bottle_ml - self.fed_ml,
             "overflow": self._full_ml - self.volume_ml,
         }
 

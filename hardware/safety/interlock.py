@@ -207,6 +207,13 @@ class Interlock:
         self.budget.book(feed, waste, now)
         self._change.dosed(feed, feed if receipt.low_ml is None else np.asarray(receipt.low_ml))
 
+    def refilled(self, row: int, bottle_ml: float) -> None:
+        """Go on with a bottle that holds so much now: what an empty one has led to is over."""
+        self.budget.bottle_ml[row] = self.budget.fed_ml[row] + bottle_ml
+        self._change.refilled(row)
+        if list(REMEDIES)[int(self._hold_kind[row])] == "no_dilution":
+            self._hold_until_s[row] = -math.inf
+
     def latch(self, response: Response, rows: Mask) -> None:
         """Never respond with less than this for `rows`, shape (N,), in this run."""
         self._latched = np.where(rows, np.maximum(self._latched, float(response)), self._latched)

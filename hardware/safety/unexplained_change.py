@@ -27,7 +27,7 @@ class UnexplainedChange:
 
     remembers = (
         "_od", "_at", "_since_ml", "_since_low_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
-        "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
+        "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased", "_doubt_ml",
     )  # fmt: skip
 
     def __init__(self, config: SafetyConfig, max_rate: float, tube_ml: Array) -> None:
@@ -40,6 +40,7 @@ class UnexplainedChange:
         self._excess, self._deficit, self._futile = np.zeros(n), np.zeros(n), np.zeros(n)
         self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
         self._helpless_od = np.full(n, math.nan)  # highest OD since full feed was found not to be enough; nan: it is
+        self._doubt_ml = np.zeros(n)  # dosed since the excess was 0
         self._eased = np.zeros(n)  # samples in a row that speak against it
 
     def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
@@ -128,11 +129,16 @@ class UnexplainedChange:
         rising, falling, futile_now = (self._over >= PERSISTENCE).T & usual
         short = full & (od > setpoint * (1.0 + c.drift))
         helpless = self._lasting(futile_now & ~rising & short, od, usual, short, limit)
+        began = usual & (self._excess <= 0.0)
+        doubt_ml = self._doubt_ml = np.where(began, 0.0, self._doubt_ml) + np.where(usual, self._since_ml, 0.0)
         self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
         self._futile = np.where((futile_now & short) | rising, 0.0, futile)
         return [
             Finding(
-                "no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be", rising
+                "no_dilution",
+                rising,
+                lambda i: f"ln OD is {excess[i]:.2f} too high: of {doubt_ml[i]:.1f} mL some or all was air",
+                rising,
             ),
             Finding(
                 "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain", falling
@@ -158,6 +164,10 @@ class UnexplainedChange:
         self._helpless_od = np.where(ends, math.nan, np.where(lasts & usual, highest, self._helpless_od))
         self._helpless_od = np.where(begins & ~lasts, od, self._helpless_od)
         return np.asarray(np.isfinite(self._helpless_od))
+
+    def refilled(self, row: int) -> None:
+        """Forget what speaks for an empty bottle."""
+        self._excess[row] = self._over[row, 0] = self._since_low_ml[row] = 0.0
 
     def dosed(self, feed_ml: Array, low_ml: Array) -> None:
         """Book what was dosed, at most and at least, mL, shape (N,)."""

@@ -21,9 +21,9 @@ REMEDY = "the file was changed by hand: put it back as the run wrote it, or star
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
     f'"kind":"{kind}"'.encode()
-    for kind in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "start")
+    for kind in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "bottle", "start")
 )
-"""Identities, blanks, targets, hand-overs, overflow pumps, levels, counted shares, starts: valid for days."""
+"""Identities, blanks, targets, hand-overs, overflow pumps, levels, counted shares, bottles, starts: valid for days."""
 
 
 def plain(value: Any) -> Any:

@@ -16,7 +16,7 @@ from hardware.storage.recorder import Recorder
 __all__ = ["NAME", "Mark", "add_mark", "read_marks"]
 
 NAME = "marks.csv"
-MEASURED = ("level_ml", "share", "sd")
+MEASURED = ("level_ml", "share", "sd", "bottle_ml")
 COLUMNS = ("time_min", "reactor", "text", "written", *MEASURED)
 
 
@@ -24,7 +24,8 @@ COLUMNS = ("time_min", "reactor", "text", "written", *MEASURED)
 class Mark:
     """What happened at minute `time_min` of a run to `reactor`; "" is all of them.
 
-    level_ml: volume in its vial then. share, sd: of the second species, counted in a sample of then. None: nobody did.
+    level_ml: volume in its vial then. share, sd: of the second species, counted in a sample of then. bottle_ml: what
+    its bottle was filled to. None: nobody did.
     """
 
     time_min: float
@@ -33,11 +34,12 @@ class Mark:
     level_ml: float | None = None
     share: float | None = None
     sd: float | None = None
+    bottle_ml: float | None = None
 
     @property
     def measured(self) -> bool:
         """Whether the run takes something over."""
-        return self.level_ml is not None or self.share is not None
+        return (self.level_ml, self.share, self.bottle_ml) != (None, None, None)
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
@@ -47,7 +49,7 @@ def add_mark(folder: Path, mark: Mark) -> Path:
     """
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with _alone(folder), Recorder(folder / NAME, COLUMNS) as file:
-        cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, mark.level_ml, mark.share, mark.sd)
+        cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, *(getattr(mark, key) for key in MEASURED))
         file.write(dict(zip(COLUMNS, cells, strict=True)))
     return folder / NAME
 

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import re
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -187,6 +188,28 @@ def test_a_level_and_the_doses_after_it_are_replayed_in_their_order(tmp_path: Pa
     made.close()
 
 
+def test_a_bottle_that_was_filled_is_dosed_from_at_once_and_counted_from_then_also_after_a_kill(tmp_path: Path) -> None:
+    """Without its mark nothing is dosed for the rest of the pause, and the ledger ends the doses when it is full."""
+    made, steps, marks = begun(tmp_path, "M0", minutes=90.0)
+    inject(made.device, "media_left_ml", "M0", 0.0)
+    reasons = ""
+    while "no_dilution" not in reasons:
+        reasons = next(steps).reasons[0] or ""
+    assert re.search(r"of \d+\.\d mL some or all was air", reasons)
+    inject(made.device, "media_left_ml", "M0", 700.0)
+    add_mark(tmp_path, Mark(1.0, "M0", "bottle", bottle_ml=700.0))
+    marks.take(made.loop)
+    fed_ml = float(made.loop.interlock.budget.fed_ml[0])
+    first = next(steps)
+    assert first.volume_ml[0] > 0.0
+    later = [next(steps) for _ in range(20)]
+    assert not any("no_dilution" in (step.reasons[0] or "") for step in [first, *later])
+    dies(made)
+    made.begin()
+    assert made.loop.interlock.budget.bottle_ml[0] == pytest.approx(fed_ml + 700.0)
+    made.close()
+
+
 def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -242,9 +265,9 @@ def test_what_was_counted_stands_before_the_note_which_is_cut_to_a_line(tmp_path
     assert (second.text, second.level_ml, third.text, third.level_ml) == ("level 0 mL", 0.0, "level 40 mL, foam", 40.0)
     with pytest.raises(ValueError, match=r"share = 0\.4: allowed null beside level_ml: mark them one after the other"):
         MarkConfig(str(folder), "M0", share=0.4, level_ml=20.0)
-    for measured in ({"share": 0.4}, {"level_ml": 18.5}):
-        with pytest.raises(ValueError, match=r"reactor = '': allowed the one in which level_ml or share was measured"):
-            MarkConfig(str(folder), **measured)
+    for key, value in {"share": 0.4, "level_ml": 18.5, "bottle_ml": 500.0}.items():
+        with pytest.raises(ValueError, match=f"reactor = '': allowed the one that {key} is of"):
+            MarkConfig(str(folder), **{key: value})
     with pytest.raises(ValueError, match="minute = 3.0"):  # a level is of now
         MarkConfig(str(folder), "M0", level_ml=18.5, minute=3.0)
     (folder / "journal.jsonl").write_text("")
