@@ -49,7 +49,7 @@ def diagnose(
     if age_s > config.stale_s:
         remedy = f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal"
         if state.spoilt:
-            remedy = f"{', '.join(state.spoilt)} was set to no number: only a restart of the device's software helps"
+            remedy = f"{', '.join(state.spoilt)} holds no number: only a restart of the device's software helps"
         return Fault("stalled", f"no new sample for {age_s:.0f} s, cycles {state.cycles}", remedy)
     if overflow_trouble:
         return Fault("overflow_pump", overflow_trouble, "close the device's web page everywhere; restart the device")

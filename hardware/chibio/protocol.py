@@ -84,7 +84,7 @@ class DeviceState:
     sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
     just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
     regulation. modes: what else would act on its own. slots: of fluorescence, those that the device shows. spoilt:
-    pumps that were set to no number, at whose dump in every tenth cycle the thread ends.
+    items that hold no number, at whose dump in every tenth cycle the thread ends.
     """
 
     selected: str
@@ -202,12 +202,6 @@ def _terminal(data: Any) -> str:
     return _line(str(text)[:400].split("</br>", 1)[0])
 
 
-def _spoilt(pump: Any) -> bool:
-    """Tell whether a pump's target or its record, if it has one, holds nan, which stays."""
-    record = pump.get("record")
-    return any(x != x for x in (pump["target"], *(record if isinstance(record, list) else ())))
-
-
 def _slot(data: Any, name: str) -> Slot:
     """Parse a slot; settings are empty and values nan where it is off."""
     on, entry = _flag(data, name, "ON"), _get(data, name)
@@ -261,7 +255,7 @@ def parse_state(body: bytes) -> DeviceState:
         volume_ml=_number(data, "Volume", "target"),
         terminal=_terminal(data),
         slots=tuple(_slot(data, n) for n in SLOTS if n in data),
-        spoilt=tuple(p for p in PUMPS if _spoilt(data[p])),
+        spoilt=tuple(key for key, item in data.items() if "NaN" in json.dumps(item)) if b"NaN" in body else (),
     )
 
 

@@ -48,7 +48,7 @@ class Station:
         self.fluorescence = Fluorescence(connection, config.fluorescence, book)
         self.busy = self.restored = False
         self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
-        self._spoilt: tuple[str, ...] = ()  # pumps that were no number at the last look
+        self._spoilt = False  # it was told that the device holds something that is no number
         self._ended = ""  # why this program ended the experiment, "" once it runs again
         self._target_c = config.temperature
         self._heat = True
@@ -320,14 +320,15 @@ class Station:
                 self._mend(f"{item} was off", "switched on again", connection.switch, item, True)
 
     def _unspoil(self, state: DeviceState) -> None:
-        """Set a pump's target to a number again, before the device keeps it on record; tell what it has there."""
-        for pump in state.spoilt:
-            if math.isnan(state.pump_targets[PUMPS.index(pump)]):
-                self._mend(f"{pump} was set to no number by somebody", "set to 0", self.connection.target, pump, 0.0)
-            elif pump not in self._spoilt:
-                what = "set to no number by somebody, and measuring will end at the device's next dump"
-                self.book.tell(f"{pump} was {what}: restart the device's software, the run goes on then")
-        self._spoilt = state.spoilt
+        """Set a pump's target to a number again, before the device works with it; tell where it has."""
+        for item in state.spoilt:
+            if item in PUMPS and math.isnan(state.pump_targets[PUMPS.index(item)]):
+                self._mend(f"{item} was set to no number by somebody", "set to 0", self.connection.target, item, 0.0)
+            elif not self._spoilt:
+                what = f"{', '.join(state.spoilt)} hold no number, and measuring will end at the device's next dump"
+                self.book.tell(f"{what}: restart the device's software, the run goes on then")
+                self._spoilt = True
+        self._spoilt = self._spoilt and bool(state.spoilt)
 
     def _mend(self, found: str, done: str, request: Callable[[str, Any], None], item: str, value: float) -> None:
         try:

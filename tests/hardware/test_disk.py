@@ -224,6 +224,6 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         assert (reader.cut, reader.next_row) == (len(torn), 12)
     assert all(
         json.loads(b"{" + mark + b"}")["kind"]
-        in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "start")
+        in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "bottle", "start")
         for mark in LANDMARKS
     )
