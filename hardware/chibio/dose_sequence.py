@@ -54,8 +54,8 @@ class DoseSequence:
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
       what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
-      sample a dose was decided for, None where the device's records begin anew; stray_s,
-      clock time at which somebody's dose was last seen or told.
+      sample a dose was decided for, None where the device's records begin anew; stray_s, clock time at which somebody's
+      dose was last seen or told.
     """
 
     def __init__(self, context: Context) -> None:

@@ -79,14 +79,6 @@ def _measure_temperature(s: Software, which: str, m: str) -> Steps:
     yield 0.003
 
 
-def _spectrum(s: Software, gain: str, m: str) -> Steps:
-    int(gain[1:])
-    app = s.app(m)
-    yield from app.optics.expose(LONG_ROUTE_S / 2)
-    raw = yield from app.optics.expose(LONG_ROUTE_S / 2)
-    app.data["AS7341"]["spectrum"]["CLEAR"] = raw
-
-
 def _reset(s: Software) -> Steps:
     app = s.apps[s.selected]
     app.initialise(s.selected)
@@ -114,7 +106,6 @@ ROUTES = (
     Route("POST", "/CalibrateOD/*/*/*/*", _calibrate),
     Route("POST", "/MeasureTemp/*/*", _measure_temperature),
     Route("POST", "/MeasureFP/*", lambda s, m: s.app(m).optics.measure_fluorescence()),
-    Route("POST", "/GetSpectrum/*/*", _spectrum),
     Route("POST", "/Experiment/*/*", lambda s, value, m: s.app(m).experiment.start_or_stop(int(value))),
     Route("POST", "/ExperimentReset", _reset),
     Route("POST", "/ClearTerminal/*", lambda s, m: clear_terminal(s.app(m).data, s.computer.stamp())),

@@ -21,7 +21,7 @@ ANSWERS = {  # by method and status
         /changeDevice/M0 /changeDevice/M5 /scanDevices/all /scanDevices/M5 /SetOutputTarget/Pump1/M0/0.02
         /SetOutputTarget/Pump1/0/0.02 /SetOutputOn/Pump1/0/M0 /SetOutputOn/Zigzag/1/M0 /Direction/Pump1/M0
         /MeasureOD/M0 /CalibrateOD/OD0/M0/14000/0 /CalibrateOD/OD/M0/14000/0 /MeasureTemp/IR/M0 /MeasureFP/M0
-        /GetSpectrum/x4/M0 /Experiment/0/M0 /ExperimentReset /ClearTerminal/M0
+        /Experiment/0/M0 /ExperimentReset /ClearTerminal/M0
         /SetFPMeasurement/FP1/LEDB/CLEAR/nm510/nm550/x10 /SetOutputTarget/Pump1/M0/0%2e02""",
     ("GET", 308): "/getSysdata",
     ("POST", 308): "//changeDevice//M0",
@@ -37,7 +37,7 @@ ANSWERS = {  # by method and status
         /SetOutputTarget/Chemostat/M0/0.02 /SetOutputTarget/GrowthRate/M0/1 /SetOutputTarget/Zigzag/M0/1
         /SetOutputTarget/OD0/M0/14000 /SetOutputOn/Pump1/0.5/M0 /SetOutputOn/Volume/0/M0
         /SetOutputOn/Chemostat/0/M0 /SetOutputOn/OD0/0/M0 /SetOutputOn/Pump9/0/M0 /CalibrateOD/Blank/M0/14000/0
-        /MeasureTemp/Culture/M0 /GetSpectrum/four/M0""",
+        /MeasureTemp/Culture/M0""",
 }
 
 
@@ -136,7 +136,6 @@ def test_only_the_selected_reactor_is_served_and_an_absent_one_is_ignored() -> N
     ("path", "seconds"),
     [
         ("/MeasureOD/M0", 0.97),
-        ("/GetSpectrum/x1/M0", 1.9),
         ("/SetOutputOn/Pump1/0/M0", 0.0),
         *((f"/SetOutputTarget/Stir/M0/{k}", s) for k, s in ((0.4, 1.5), (0.5, 2.25), (0.8, 2.25), (0.9, 3.0))),
     ],
@@ -235,7 +234,7 @@ def test_same_seed_same_readings_another_seed_others() -> None:
 def test_thousands_of_random_requests_leave_a_device_that_answers() -> None:
     rng = np.random.default_rng(5)
     verbs = {"SetOutputTarget": 3, "SetOutputOn": 3, "Direction": 2, "MeasureOD": 1, "CalibrateOD": 4, "Experiment": 2}
-    verbs |= {"changeDevice": 1, "MeasureTemp": 2, "ClearTerminal": 1, "SetFPMeasurement": 6, "GetSpectrum": 2}
+    verbs |= {"changeDevice": 1, "MeasureTemp": 2, "ClearTerminal": 1, "SetFPMeasurement": 6}
     verbs |= {"getSysdata": 0, "getSysdata/": 0, "ExperimentReset": 0}
     arguments = ["Pump1", "Pump2", "Stir", "OD", "OD0", "Thermostat", "Heat", "Zigzag", "Light", "FP1", "LASER650"]
     arguments += ["M0", "M1", "0", "1", "2", "-1", "0.5", "nan", "inf", "1e400", "", "%00", "x", "IR", "Internal", "é"]
