@@ -107,7 +107,7 @@ class Rig:
         with (self.folder / f"{name.replace(' ', '-')}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
                 command, env=variables, stdout=log, stderr=log, cwd=self.folder, start_new_session=True,
-                preexec_fn=_end_with_us,
+                preexec_fn=_as_on_a_unit,
             )  # fmt: skip
 
     def _variables(self, unit: str) -> dict[str, str]:
@@ -181,8 +181,13 @@ def _kill(pids: Sequence[int]) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def _end_with_us() -> None:
-    """In a child: be killed when the process that started us is, whatever ended it."""
+def _as_on_a_unit() -> None:
+    """In a child: hear every signal, and be killed when the process that started us is, whatever ended it.
+
+    The vendor stops jobs by SIGINT, which a worker process holds back and a shell's background job ignores.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 

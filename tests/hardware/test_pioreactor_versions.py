@@ -23,6 +23,7 @@ from hardware.pioreactor.versions import TESTED, Facts, facts
 from hardware.pioreactor.web import NotHeard, Web
 from hardware.rig import build
 from hardware.rig.files import flows
+from hardware.rig.processes import _as_on_a_unit
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
 from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig, started
 
@@ -314,6 +315,22 @@ def test_the_vendor_s_estimate_from_the_plate_s_cooling_is_the_vial_s_temperatur
     )  # fmt: skip
     assert told.returncode == 0, told.stderr
     assert json.loads(told.stdout.splitlines()[-1]) == pytest.approx([one["true"] for one in series], abs=0.4)
+
+
+def test_what_the_rig_starts_hears_ctrl_c_whoever_started_the_rig():
+    """A worker holds the signal back, a background job of a shell ignores it; the vendor stops jobs by it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        job = subprocess.Popen(["sleep", "600"], preexec_fn=_as_on_a_unit)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        signal.signal(signal.SIGINT, before)
+    job.send_signal(signal.SIGINT)
+    try:
+        assert job.wait(LONG_S) == -signal.SIGINT
+    finally:
+        job.kill()
 
 
 # -- the table, by itself -------------------------------------------------------------------------------------------
