@@ -13,14 +13,15 @@ import numpy as np
 
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
-from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, WASTE, Moved, Pumps, Request, Steps
+from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, STEP_S, WASTE, Moved, Pumps, Request
 from hardware.stations import Plan
 from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given
 
 __all__ = ["Doses", "History", "replay"]
 
-DRAINS = 5  # attempts to empty a vial
+DRAIN_ML = 4.0  # at a time and more, while a media pump runs on
+DRAINS = 5  # attempts to empty a vial after that
 UNSEEN = "its end was not on record: at most what was asked, unless its pump was found on"
 
 
@@ -68,7 +69,8 @@ class Doses:
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
         self._ran_s, self._strange_ml = {MEDIA: 0.0, WASTE: 0.0}, {MEDIA: 0.0, WASTE: 0.0}
-        self._rest_ml = np.zeros(3)  # fed at most, at least, and risen, beyond what was booked
+        self._booked_ml = self._taken_ml = self._ran_on_ml = self._net_ml = self._spilled_ml = 0.0  # of a dose
+        self._known_ml, self._rest_ml = np.zeros(3), np.zeros(3)  # fed at most, at least, risen, beyond what is booked
 
     @property
     def running(self) -> bool:
@@ -78,7 +80,8 @@ class Doses:
     def restore(self, history: History) -> None:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
-        self._course = self._look_for(history) if history.open else None
+        if history.open:
+            self._course = self._drained(self._look_for(history), history.feed_ml, history.id)
 
     def plan(self, rate: float) -> Plan:
         """Plan the dose of a mean rate, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
@@ -106,7 +109,7 @@ class Doses:
             doses=self._count, on_s=on_s, id=dose,
         )  # fmt: skip
         if dosing:
-            self._course = self._dose(plan, dose, on_s)
+            self._course = self._drained(self._dose(plan, dose, on_s), plan.feed_ml, dose)
             self.work()
         return plan
 
@@ -123,7 +126,9 @@ class Doses:
         """Do what is due; called again and again."""
         if self._course is None:
             self._settle_pins()
-            self._course = next((self._silence(job) for job in (MEDIA, WASTE) if self.pumps.odd(job)), None)
+            if job := next((job for job in (MEDIA, WASTE) if self.pumps.odd(job)), ""):
+                name = f"{self.pumps.short}/{self._book.elapsed():.0f}"
+                self._course = self._drained(self._silence(job, name), 0.0, name)
         if self._course is None or self._clock.now() < self._due:
             return
         try:
@@ -148,7 +153,7 @@ class Doses:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(MEDIA, plan.feed_ml, dose)), Moved()
-        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not self.pumps.halted:
+        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (self.pumps.halted or self._ran_on_ml):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         yield from self._conclude(plan, dose, on_s, media, waste)
 
@@ -168,45 +173,97 @@ class Doses:
         yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
-        """Conclude a dose: record its end, drain the vial to its tube, then correct what was booked when it began."""
+        """Conclude a dose: record its end, then correct what was booked since it began."""
         self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
         for moved, pump in ((media, "media"), (waste, "waste")):
             if moved.end:
                 self._book.tell(f"{pump}: {moved.end}")
-        taken = waste.low + media.drained
-        row = Ending(on_s, media.high, taken, feed_low_ml=media.low).row()
-        high_ml, end = waste.high + media.drained, media.end or waste.end
+        high_ml, end = waste.high + self._taken_ml, media.end or waste.end
+        self._taken_ml += waste.low
+        row = Ending(on_s, media.high, self._taken_ml, feed_low_ml=media.low).row()
         self._book.log("dose_end", **row, waste_high_ml=high_ml, id=dose, end=end)
-        if media.high > plan.feed_ml + LATE_ML:
-            taken += yield from self._drain(media, dose)
-        rise = max(min(media.high, self._room_ml) - taken, 0.0)
-        self._rest_ml += media.high - plan.feed_ml, media.low - plan.feed_ml, rise
-        if np.abs(self._rest_ml).max() > LATE_ML:  # little is booked once it is much
+        self._over(media, plan.feed_ml)
+        yield from ()
+
+    def _over(self, media: Moved, booked_ml: float) -> None:
+        """Count what a media pump gave that is off. Args: booked_ml: of it, with its waste, when it began."""
+        if self._ran_on_ml or media.high > booked_ml + LATE_ML:
+            self._ran_on_ml = media.high
+        self._net_ml -= booked_ml + self._spilled_ml  # its waste counts as it was taken; less may have run over
+        self._account(media.high - booked_ml, media.low - booked_ml)
+
+    def _account(self, more_ml: float, less_ml: float) -> None:
+        """Count what was fed, at most and at least, beyond what was booked when it began, and what the vial has of it.
+
+        Little is booked once it is much.
+        """
+        net_ml = self._booked_ml + more_ml - self._taken_ml
+        rise_ml = max(self._known_ml[2] + net_ml - self._net_ml, 0.0)
+        self._spilled_ml += max(rise_ml - self._room_ml, 0.0)
+        known_ml = np.array([more_ml, less_ml, min(rise_ml, self._room_ml)])
+        self._rest_ml += known_ml - self._known_ml
+        self._known_ml, self._net_ml = known_ml, net_ml
+        if np.abs(self._rest_ml).max() > LATE_ML:
             more, less, rise = self._rest_ml.tolist()
             self.extra.append(Given(self._book.elapsed(), more, less, more - rise))
             self._rest_ml = np.zeros(3)
 
-    def _drain(self, media: Moved, dose: str) -> Steps[float]:
-        """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out, mL."""
-        self._book.tell("the vial is drained of what the media pump gave while it ran on, before it is dosed again")
-        wanted, taken = self._config.waste_factor * min(media.high - media.drained, self._room_ml), 0.0
-        for k in range(DRAINS):
-            if wanted - taken > LATE_ML and not self.pumps.halted:
-                taken += (yield from self.pumps.give(WASTE, wanted - taken, f"{dose}/drain{k}")).low
-        return taken
+    def _drained(self, course: Iterator[float], booked_ml: float, name: str) -> Iterator[float]:
+        """Go through a dose, and drain the vial beside and after it of what a media pump gives that runs on.
+
+        What it may have given is booked as it flows. Args: booked_ml: when the dose began. name: of the drains.
+        """
+        self._booked_ml = self._net_ml = booked_ml
+        self._taken_ml = self._ran_on_ml = self._spilled_ml = self.pumps.flowed_ml = 0.0
+        self._known_ml = np.zeros(3)
+        over, portion, number, after = False, None, 0, 0
+        while True:
+            over = over or next(course, None) is None
+            more_ml, less_ml = self._known_ml[:2].tolist()
+            self._account(more_ml if over else max(more_ml, self.pumps.flowed_ml - booked_ml), less_ml)
+            if portion is None and after < DRAINS and (wanted_ml := self._surplus(over)) > 0.0:
+                portion, number, after = self._portion(wanted_ml, f"{name}/drain{number}"), number + 1, after + over
+            if over and portion is None:
+                return
+            if portion is not None and next(portion, None) is None:
+                portion = None
+            yield STEP_S
+
+    def _surplus(self, over: bool) -> float:
+        """Return what the waste pump is to take next of what a media pump gives that runs on, or (over) ran on, mL."""
+        pumps, factor = self.pumps, self._config.waste_factor
+        if over:
+            wanted_ml = factor * self._known_ml[2]
+            due = self._ran_on_ml > 0.0 and wanted_ml > LATE_ML
+        else:
+            wanted_ml = factor * pumps.flowed_ml - self._taken_ml
+            due = pumps.runs_on and pumps.flowed_ml > 0.0 and (wanted_ml > DRAIN_ML or not self._ran_on_ml)
+            self._ran_on_ml, wanted_ml = max(self._ran_on_ml, due * pumps.flowed_ml), max(0.5 * wanted_ml, DRAIN_ML)
+        return wanted_ml if due and not pumps.halted else 0.0
+
+    def _portion(self, ml: float, name: str) -> Iterator[float]:
+        """Have the waste pump take a portion; it counts as it is told, and in the end as it is known."""
+        before_ml, course = self._taken_ml, self.pumps.give(WASTE, ml, name)
+        self._book.tell(f"{ml:.1f} mL of waste: the vial is drained of what the media pump gives that runs on")
+        while True:
+            try:
+                yield next(course)
+            except StopIteration as ended:
+                self._taken_ml = before_ml + ended.value.low
+                return
+            self._taken_ml = before_ml + self.pumps.reported.get((WASTE, name), 0.0)
 
     # -- what nobody commanded -------------------------------------------------------------------------------------
 
-    def _silence(self, job: str) -> Iterator[float]:
+    def _silence(self, job: str, name: str) -> Iterator[float]:
         """End a pump that runs without a job, or whose job was killed, and record what it moved."""
-        pin, name = self.pumps.pin(job), f"{self.pumps.short}/{self._book.elapsed():.0f}"
+        pin = self.pumps.pin(job)
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
-            self._give(job, moved.low, moved.high, f"{job} ran without its job")
-        if job == MEDIA and moved.high > LATE_ML:
-            taken = moved.drained + (yield from self._drain(moved, name))
-            self.extra.append(Given(self._book.elapsed(), 0.0, 0.0, taken))
+            self._give(job, moved.low, moved.high, f"{job} ran without its job", booked=job == MEDIA)
+        if job == MEDIA:
+            self._over(moved, 0.0)
 
     def _settle_pins(self) -> None:
         """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too.
@@ -242,10 +299,12 @@ class Doses:
         self.foreign = f"{job} of {ml:.2f} mL without our command ({who})"
         self._give(job, ml, ml, self.foreign, beside_ml)
 
-    def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
-        """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
+    def _give(
+        self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0, booked: bool = False
+    ) -> None:
+        """Record what a pump moved beside our doses: when noticed, how much, by whom. Args: booked: elsewhere."""
         fed = job != WASTE
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, beside_ml if fed else high_ml)
-        self.extra.append(given)
+        self.extra += [] if booked else [given]
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
         self._book.log("given", **given.row(why))

@@ -37,7 +37,6 @@ ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
 NUDGE = 0.01  # of a duty, %: nobody sees it
 SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
 AGAIN_S = 15.0  # between two of them
-DRAIN_ML = 4.0  # at a time and more where it falls behind, while a media pump cannot be stopped
 
 Steps = Generator[float, None, T]
 """A course that yields what to wait, s, and returns T."""
@@ -45,12 +44,11 @@ Steps = Generator[float, None, T]
 
 @dataclass(frozen=True)
 class Moved:
-    """What a pump moved, mL, at least and at most; end, in words, "" as asked; drained by the waste pump meanwhile."""
+    """What a pump moved, mL, at least and at most; end, in words, "" as asked."""
 
     low: float = 0.0
     high: float = 0.0
     end: str = ""
-    drained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,8 @@ class Pumps:
       by the active calibrations; reported, mL by job and source of the events; counted, mL of them that whoever asked
       for them books, inf while they are under way; facts, of the unit's version; boot, when it was started; proven,
       when pumps were ended here; trouble, why no dose may be given, "" if one may; cut, whether media is to end,
-      halted, whether everything is; waits, whether what is under way waits for somebody or something else.
+      halted, whether everything is; waits, whether what is under way waits for somebody or something else; flowed_ml,
+      the most that a media pump gave up to now that is not proven off, and runs_on, whether it is to be drained.
     """
 
     def __init__(self, unit: Unit) -> None:
@@ -130,6 +129,7 @@ class Pumps:
         self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
+        self.flowed_ml, self.runs_on = 0.0, False
         self.proven: dict[str, float] = {}
         self.ours = f"{OURS}{unit.run}/"
         self.short = f"{self.ours}{unit.name}/off"
@@ -229,6 +229,7 @@ class Pumps:
         job, asked_s, what = request.job, request.asked_s, f"{request.ml:.2f} mL"
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
         never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
+        fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
         while not (
             why or self.said(request) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked_s
             or (self.lost(job) and self.box.state(job).at >= asked_s)
@@ -236,7 +237,6 @@ class Pumps:
             now, state, taken = self.clock.now(), self.box.state(job), None
             if now > asked_s + self.config.start_s and not (late or self.box.live(job)):
                 late = True
-                fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
                 self.trouble = self.trouble or fate
                 self.book.tell(fate)
             self.waits = self.waits or late
@@ -256,7 +256,7 @@ class Pumps:
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late:
-            self.trouble, self.waits = "", False
+            self.trouble, self.waits = self.trouble.replace(fate, ""), False
             if not why:
                 self.book.tell(f"{job} of {what} ran late")
         return why
@@ -290,33 +290,27 @@ class Pumps:
     def end(self, request: Request) -> Steps[Moved]:
         """End a pump that has begun, or may have, until it is proven off; what it moved (docs/pioreactor.md, Ending).
 
-        While a media pump goes on, the waste pump keeps the vial from overflowing, until `bottle_ml` may have flowed.
         What only a hand can do is said; once it was done, what is tried here ends the pump.
         """
-        job, ending, off_s, drained = request.job, ForcedEnd(self, request), math.nan, 0.0
-        drain: Steps[Moved] | None = None
-        while math.isnan(off_s) or drain is not None:
-            try:
-                next(drain or iter((0.0,)))
-            except StopIteration as over:
-                drained, drain = drained + over.value.low, None
-            if math.isnan(off_s) and math.isnan(off_s := ending.off_s()):
-                ending.act()
-                late, flowed = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
-                if late:
-                    pin, word = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
-                    how = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
-                    remedy = f"pull the pump's plug, or on the unit: {word} {pin} --as-int (it is then ended from here)"
-                    self.trouble = f"pin {pin} may run on after {job}, {how}; {remedy}"
-                self.waits = late or self.waits
-                wanted = self.config.waste_factor * flowed - drained
-                if late and drain is None and job == MEDIA and not self.halted and wanted > DRAIN_ML:
-                    portion_ml = max(DRAIN_ML, 0.5 * wanted * (flowed > drained + DRAIN_ML))
-                    drain = self.give(WASTE, portion_ml, f"{request.dose}/beside{self.clock.now():.0f}")
+        job, ending, pin = request.job, ForcedEnd(self, request), self.pin(request.job)
+        while math.isnan(off_s := ending.off_s()):
+            ending.act()
+            late, flowed_ml = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
+            if late:
+                number, unlock = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
+                how = "whose process was killed or stands still" if ending.lost else "which should have ended"
+                runs, pull = ("runs", "pull") if pin.on else ("may run", "look at the pump; if it runs, pull")
+                remedy = (
+                    f"{pull} the pump's plug, or on the unit: {unlock} {number} --as-int (it is then ended from here)"
+                )
+                self.trouble = f"pin {number} {runs} on after {job}, {how}; {remedy}"
+            self.waits = late or self.waits
+            if job == MEDIA:
+                self.flowed_ml, self.runs_on = flowed_ml, late or (self.lost(job) and pin.on)
             yield STEP_S
-        self.trouble, self.waits = "", False
+        self.trouble, self.waits, self.runs_on = "", False, False
         self.proven[job] = self.clock.now()
-        return replace(ending.moved(off_s), drained=drained)
+        return ending.moved(off_s)
 
 
 class Seen(NamedTuple):
@@ -358,7 +352,7 @@ class ForcedEnd:
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
         self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
         self._short: Future[str] | None = None
-        self._rebooted = self._lost = self._held = False
+        self._rebooted = self.lost = self._held = False
 
     def _shorts(self) -> float:
         """Sum what short runs of the pump reported, mL."""
@@ -386,7 +380,7 @@ class ForcedEnd:
     def _look(self) -> Seen:
         """Return what is known now."""
         p, pin, state = self._p, self._p.pin(self._job), self._p.box.state(self._job)
-        self._lost = self._lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
+        self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
         if p.clock.now() > p.box.heard_s + QUIET_S:
             self._quiet_s = min(self._quiet_s, p.box.heard_s)
@@ -424,7 +418,7 @@ class ForcedEnd:
         0 for the pump of a silent unit, and for one whose bottle is empty by now.
         """
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
-        silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self._lost
+        silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
         flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
         return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0
@@ -435,13 +429,13 @@ class ForcedEnd:
         ml, said_ml = self._request.ml, p.said(self._request)
         longest = max(min(off_s, self._still_s) - self._from_s, 0.0) * flow
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
-        if self._held or self._untold or (ran <= 0.0 and self._lost):  # since when it runs was never heard
+        if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
             ran = longest
         low, end = max(said_ml - ROUNDED_S * flow, 0.0), "ended from here"
         if ran <= 0.0:  # its pin was never seen: a job times itself
             return Moved(low, max(ml, said_ml), end)
         if self._rebooted:
             return Moved(low, max(ran, min(ml, ran + p.config.reading_s * flow)), "the unit was started again in it")
-        if p.broke(self._request) and not self._lost:  # a job that loses the broker ends; when was not heard
+        if p.broke(self._request) and not self.lost:  # a job that loses the broker ends; when was not heard
             ran = min(ran, max(ml, said_ml))
         return Moved(low, max(ran, said_ml), end)

@@ -585,6 +585,10 @@ class Lab:
         """What the interlock has booked: a dose when it began, with all that the driver said of it since."""
         budget = FeedBudget(SafetyConfig(), self.bench, np.full(1, self.bench.volume_ml), np.full(1, 1e3))
         budget.book(np.array([planned_ml]), np.array([2.0 * planned_ml]), 0.0)
+        self.book(budget)
+        return budget
+
+    def book(self, budget: FeedBudget) -> None:
+        """Book what the driver said of doses since the last time."""
         for at, receipt in self.reactors.repeated():
             budget.book(receipt.volume_ml, receipt.waste_ml, at)
-        return budget
