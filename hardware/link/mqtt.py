@@ -22,8 +22,8 @@ class MqttLink:
       topics: filters that are subscribed to. take: called with topic, payload and whether it was retained, on the
         connection's thread; what it raises is lost. again: called before anything arrives on a new connection.
       will: topic of ours whose retained message the broker clears when we are gone.
-    Attributes: broke_s, when the connection was last lost, by `clock`; refusal, why the broker does not let us in, ""
-      if it did or was not reached.
+    Attributes: broke_s, when the connection was last lost, by `clock`; lost, why, in words; refusal, why the broker
+      does not let us in, "" if it did or was not reached.
     Raises: LinkError if the library or a certificate is missing, or the broker is not there.
     """
 
@@ -36,7 +36,7 @@ class MqttLink:
         except ImportError:
             raise LinkError("MQTT needs its library: pip install 'paho-mqtt>=2'") from None
         self._clock, self._topics, self._again, self._will, self._kept = clock, tuple(topics), again, will, ""
-        self.broke_s, self.refusal, self._is_up = -math.inf, "", False
+        self.broke_s, self.lost, self.refusal, self._is_up = -math.inf, "", "", False
         self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
         self._client.username_pw_set(username, password)
         self._client.reconnect_delay_set(1, 5)
@@ -72,7 +72,8 @@ class MqttLink:
                 client.publish(self._will, self._kept, qos=1, retain=True)
             self._is_up = True
 
-    def _down(self, *_: Any) -> None:
+    def _down(self, _client: Any, _user: Any, _flags: Any, reason: Any, *_: Any) -> None:
+        self.lost = str(reason)
         self.broke_s = self._clock.now() if self._is_up else self.broke_s
         self._is_up = False
 

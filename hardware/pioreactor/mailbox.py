@@ -102,7 +102,7 @@ class Mailbox:
 
     Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; pins;
       states, of each job by experiment; temperature, target, of the thermostat, degC; stir_duty, %; heard_s, when the
-      unit last said anything; dc_s, when it last told its pins; refused, how many messages were left out.
+      unit last said anything; dc_s, when it last told its pins; complaint, why its reader took no reading, by its log.
     """
 
     def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
@@ -118,7 +118,7 @@ class Mailbox:
         self.states: dict[tuple[str, str], State] = {}
         self.temperature = self.target = self.stir_duty = math.nan
         self.heard_s = self.dc_s = -math.inf
-        self.refused, self._stamp, self._said = 0, "", set[str]()
+        self.complaint, self._stamp, self._said = "", "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
         """One message. Raises: nothing."""
@@ -131,7 +131,6 @@ class Mailbox:
                     self.heard_s = self._clock.now()
                 self._enter(experiment, rest, payload, retained)
         except Exception as error:  # the thread that calls must go on, whatever somebody sends
-            self.refused += 1
             kind = rest.rsplit("/", 1)[-1][:40]
             if kind not in self._said and len(self._said) < 100:
                 self._said.add(kind)
@@ -167,6 +166,9 @@ class Mailbox:
                 pin.event_s = min(pin.event_s, now)
         elif rest == "od_reading/ods" and mine and payload:
             self._reading(json.loads(payload), now, retained)
+        elif rest.startswith("logs/") and rest.endswith("/error") and mine and not retained:
+            if (said := json.loads(payload))["task"] == "od_reading":
+                self.complaint = " ".join(str(said["message"]).split())[:200]
         elif rest == "temperature_automation/temperature" and mine and payload:
             self.temperature = _number(json.loads(payload)["temperature"])
         elif rest == "temperature_automation/target_temperature" and mine and payload:
@@ -195,10 +197,9 @@ class Mailbox:
         """Take a reading; a retained one is the last one of before, and one with the stamp of another is the same."""
         stamp = str(said["timestamp"])
         if retained or stamp == self._stamp:
-            self.refused += 1
             return
         mine = said["ods"][self._channel]
-        value, self._stamp = _number(mine["od"]), stamp
+        value, self._stamp, self.complaint = _number(mine["od"]), stamp, ""
         self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:

@@ -5,7 +5,6 @@ goes on, and is over when it has said so and its pin is off. Every other course 
 Times here are real seconds.
 """
 
-import contextlib
 import math
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
@@ -37,6 +36,7 @@ ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
 NUDGE = 0.01  # of a duty, %: nobody sees it
 SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
 AGAIN_S = 15.0  # between two of them
+UNTOLD = 2  # runs in a row of which no pin was told; with one more no pump is followed
 
 Steps = Generator[float, None, T]
 """A course that yields what to wait, s, and returns T."""
@@ -64,12 +64,16 @@ class Request:
 
 
 class Calls:
-    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often."""
+    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often.
+
+    Attributes: failed, of each kind that was not answered well the last time, since when, and how.
+    """
 
     def __init__(self, web: Web, clock: Clock) -> None:
         self._web, self._clock = web, clock
         self._open: dict[str, Future[Any]] = {}
         self._next: dict[str, float] = {}
+        self.failed: dict[str, tuple[float, str]] = {}
 
     def due(self, kind: str, every_s: float) -> bool:
         """Whether something of this kind is to be done now."""
@@ -82,8 +86,11 @@ class Calls:
         if kind not in self._open and self.due(kind, every_s):
             self._open[kind] = self._web.ask(what, *given)
         if kind in self._open and self._open[kind].done():
-            with contextlib.suppress(ReactorError):
+            since_s, _ = self.failed.pop(kind, (self._clock.now(), ""))
+            try:
                 return (self._open.pop(kind).result(),)
+            except ReactorError as error:
+                self.failed[kind] = since_s, str(error)
         return None
 
 
@@ -129,7 +136,7 @@ class Pumps:
         self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
-        self.flowed_ml, self.runs_on = 0.0, False
+        self.flowed_ml, self.runs_on, self._untold = 0.0, False, 0
         self.proven: dict[str, float] = {}
         self.ours = f"{OURS}{unit.run}/"
         self.short = f"{self.ours}{unit.name}/off"
@@ -191,7 +198,7 @@ class Pumps:
             if not self.mqtt.connected:
                 raise LinkError("no MQTT broker, so nobody would follow it")
         except ReactorError as error:
-            return Moved(end=f"not given: {error}")
+            return Moved(end=f"not given, the next sample is dosed: {error}")
         request = Request(job, round(ml, 4), dose, self.clock.now(), self.pin(job).ran_s)
         self.counted[job, dose] = math.inf
         try:
@@ -200,7 +207,7 @@ class Pumps:
             self.book.log("task", id=dose, job=job, task=request.task)
         except NotHeard as error:
             self.counted[job, dose] = 0.0
-            return Moved(end=f"not given: {error}")
+            return Moved(end=f"not given, the next sample is dosed: {error}")
         except ReactorError as error:
             self.book.tell(f"{job}: whether it was heard is unknown: {error}")
         moved = yield from self.follow(request)
@@ -218,6 +225,9 @@ class Pumps:
             if unwanted or self.odd(job) or self.broke(request) or self.clock.now() > late:
                 return (yield from self.end(request))
             yield STEP_S
+        self._untold = 0 if self.pin(job).on_s >= request.asked_s else self._untold + 1
+        if self._untold > UNTOLD:
+            self.box.dc_s = -math.inf  # until the unit tells its pins again
         return self._moved(request)
 
     def broke(self, request: Request) -> bool:
@@ -296,7 +306,11 @@ class Pumps:
         while math.isnan(off_s := ending.off_s()):
             ending.act()
             late, flowed_ml = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
-            if late:
+            if late and self.broke(request) and not ending.lost:
+                self.trouble = (
+                    f"the broker was lost in {job}, which ends with it; whether its pump is off is being verified"
+                )
+            elif late:
                 number, unlock = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
                 how = "whose process was killed or stands still" if ending.lost else "which should have ended"
                 runs, pull = ("runs", "pull") if pin.on else ("may run", "look at the pump; if it runs, pull")

@@ -16,6 +16,7 @@ from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import TESTED, facts
+from hardware.pioreactor.web import REMEDY
 from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
 
@@ -27,6 +28,7 @@ SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
 UNHEARD = "the unit told nothing of its pins when one was switched, so no dose could be followed"
+SHOW_PINS = f"stop and start stirring in the vendor's page, else reboot the unit; tried with {', '.join(TESTED)}"
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
@@ -54,7 +56,7 @@ class Station:
         self._gone, self._been, self._ended, self._missing = set[str](), set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
         self._listed = set[str]()
-        self._target_sent_s, self._target_sends, self._trouble = math.inf, 0, ""
+        self._target_sent_s, self._target_sends = math.inf, 0
 
     # -- bringing up -----------------------------------------------------------------------------------------------
 
@@ -65,6 +67,8 @@ class Station:
         yield from self._pumps.calibrate()
         rows = yield from self._answer(self._web.running)
         self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
+        if history.boot not in ("", self._pumps.boot):  # which sets all pins to 0
+            self._pumps.proven = dict.fromkeys((MEDIA, WASTE), self._real.now())
         if AUTOMATION in self._listed and not self.handed_over:
             raise DeviceStateError("a dosing automation of the vendor's runs, and would dose too; stop it in its page")
         self.doses.restore(history)
@@ -188,7 +192,8 @@ class Station:
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
         if not self._mqtt.connected:
-            return Fault("link", "no MQTT broker", "look at the leader: power, network, mosquitto; doses wait")
+            why = f"no MQTT broker at {self._config.broker}: {self._mqtt.lost or 'nothing comes'}"
+            return Fault("link", why, "on the leader: power, network, sudo systemctl restart mosquitto; doses wait")
         if self._pumps.trouble:
             return Fault("pump", self._pumps.trouble, "nothing is dosed until that is known")
         if other := self._mqtt.holder(self.name):
@@ -207,12 +212,17 @@ class Station:
             twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
             again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
             remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
-            return Fault("stopped", f"the unit {GONE[job]}", remedy)
+            detail = f"the unit {GONE[job]}"
+            if job == OD and self._box.complaint:
+                detail, remedy = f"{detail}, its log says: {self._box.complaint}", "do what that says; doses wait"
+            elif self._real.now() > self._box.heard_s + SILENT_S:
+                detail += ", and nothing else comes from it by MQTT: look at its power and network"
+            return Fault("stopped", detail, remedy)
         if math.isinf(self._box.dc_s):
-            return Fault("pump", UNHEARD, f"tried with {', '.join(TESTED)}; look whether stirring runs")
-        if self._trouble:
-            return Fault("link", self._trouble, "check the unit's web server")
-        return None
+            return Fault("pump", UNHEARD, SHOW_PINS)
+        since_s, why = self._calls.failed.get("rows", (math.inf, ""))
+        what, _, remedy = why.partition("; ")
+        return Fault("link", what, remedy or REMEDY) if self._real.now() > since_s + GRACE_S else None
 
     def _wanted(self) -> list[str]:
         """List the jobs that this run keeps going."""
@@ -223,7 +233,7 @@ class Station:
     def _there(self, job: str) -> bool:
         """Whether a job is there: by its own word, which a restarted broker forgets; by its readings; by the list."""
         longest_s = self._clock.of_real(FRESH * self._config.reading_s)
-        if job == OD and self.sampling.count:
+        if job == OD and (self.sampling.count or self.up):
             silent_s = self._clock.now() - self.sampling.read_s
             if silent_s < longest_s or silent_s > self._clock.of_real(SILENT_S):
                 return silent_s < longest_s
@@ -247,11 +257,8 @@ class Station:
 
     def _again(self, job: str) -> Iterator[float]:
         """Start a job anew; one that is there and does nothing is first ended."""
-        try:
+        with suppress(ReactorError):
             yield from self._answer(self._web.stop, job) if self._box.live(job) else self._start(job)
-            self._trouble = ""
-        except ReactorError as error:
-            self._trouble = str(error)
 
     # -- commands --------------------------------------------------------------------------------------------------
 
@@ -304,9 +311,11 @@ class Station:
                 or any(box.live(job) or pumps.odd(job) for job in (MEDIA, WASTE))
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
-                    seen = f"pin {box.on()[0]} on" if box.on() else "not verified off"
+                    seen, do = "not verified off", "look at its pumps; pull the plug of one that runs"
+                    if box.on() or any(map(pumps.odd, (MEDIA, WASTE))):
+                        seen, do = f"pin {(*box.on(), 'of a killed job')[0]} on", "pull the plug of its pumps"
                     why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"
-                    raise DeviceStateError(f"pumps of {self.name}: {seen}; pull the plug of its pumps. {why}")
+                    raise DeviceStateError(f"pumps of {self.name}: {seen}; {do}. {why}")
                 self.go_on()
                 yield STEP_S
         finally:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from http import HTTPStatus
 from typing import Any, TypeVar
 from urllib.parse import quote
 
@@ -11,10 +12,11 @@ import httpx
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import fetch
 
-__all__ = ["NotHeard", "Web"]
+__all__ = ["REMEDY", "NotHeard", "Web"]
 
 T = TypeVar("T")
 
+REMEDY = "if that stays, on the unit: sudo systemctl restart pioreactor-web.target"
 OVER = ("complete", "succeeded", "failed")  # states of a task that was taken and is over, in whatever version
 
 
@@ -102,9 +104,9 @@ class Web:
         try:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
         except LinkError as error:
-            if isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout):
-                raise NotHeard(str(error)) from error
-            raise
+            text = f"{str(error).partition('; ')[0]}; check the unit's power and network; {REMEDY}"
+            nobody = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
+            raise (NotHeard if nobody else LinkError)(text) from error
         try:
             answer = json.loads(said or b"null")
         except (ValueError, RecursionError):
@@ -114,8 +116,10 @@ class Web:
         if status < 300:
             return answer
         reason = answer.get("error", answer) if isinstance(answer, dict) else answer
-        text = f"{url}: status {status}: {' '.join(str(reason).split())[:160]}"
-        raise NotHeard(text) if 400 <= status < 500 else ProtocolError(text)
+        if str(reason).lstrip().startswith("<"):  # a page for people
+            reason = HTTPStatus(status).phrase
+        text = f"{url}: its web server answered with status {status}: {' '.join(str(reason).split())[:160]}"
+        raise NotHeard(text) if 400 <= status < 500 else ProtocolError(f"{text}; {REMEDY}")
 
     def close(self) -> None:
         """Idempotent; a request that hangs is left to its time-out."""

@@ -488,7 +488,7 @@ class FakeCluster:
     """`hardware.pioreactor.mailbox.Cluster`."""
 
     def __init__(self, config: PioreactorConfig, boxes: dict[str, Mailbox], name: str, clock: World) -> None:
-        self.boxes, self.world, self.broke_s, self.refusal = boxes, clock, -np.inf, ""
+        self.boxes, self.world, self.broke_s, self.refusal, self.lost = boxes, clock, -np.inf, "", ""
         self.said: list[tuple[str, str]] = []
         clock.mqtt, clock.box = self, boxes[UNIT]
         for topic, payload in clock.retained.items():

@@ -302,6 +302,30 @@ def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypa
     assert len({o["source-of-event"] for o in again.asked("add_media")}) == 2
 
 
+@pytest.mark.parametrize("rebooted", [False, True])
+def test_after_a_resume_nobody_is_told_to_pull_a_plug_while_no_pump_is_told_on(monkeypatch, rebooted):
+    """Its program was killed in a dose, which has ended since: by itself, or with the unit's power."""
+    lab = Lab(monkeypatch)
+    lab.begin()
+    lab.sample()
+    lab.dose(0.8)
+    lab.until(lambda: MEDIA_PIN in lab.world.since, 10.0)
+    if rebooted:
+        lab.world.cut()
+        lab.world.power()
+    rows, world = list(lab.rows), lab.world
+    world.box = None
+    world.sleep(20.0)
+    again = Lab(monkeypatch, world)
+    again.begin(replay(rows)[UNIT], 80.0)
+    told = []
+    while again.station.doses.running or again.fault:
+        told += [str(again.fault), *again.reactors.pumps_off(np.array([True]))]
+        again.wait(5.0)
+    assert not [line for line in told if "pull the plug of its pumps" in line or "pull the pump's plug" in line]
+    assert bool(told) is not rebooted, "a unit that booted has all pins at 0"
+
+
 def test_a_run_without_a_thermostat_is_resumed_from_its_journal_on_the_disk(monkeypatch, tmp_path):
     lab, journal = Lab(monkeypatch, thermostat=False), Journal(tmp_path / "journal.jsonl")
     lab.begin()

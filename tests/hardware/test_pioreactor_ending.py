@@ -319,6 +319,22 @@ def test_a_pump_that_told_what_it_is_about_to_give_and_no_end_is_drained_beside(
     assert low - SLACK_ML <= lab.world.truth["add_media"] <= high + SLACK_ML
 
 
+@pytest.mark.parametrize("broken", ["lose_broker", "freeze_broker"])
+def test_nobody_is_told_to_pull_a_plug_where_only_the_broker_was_gone(monkeypatch, broken):
+    """A job ends with its broker."""
+    lab = Lab(monkeypatch)
+    lab.begin()
+    lab.sample()
+    lab.dose(1.4)
+    in_the_dose(lambda lab: getattr(lab.world, broken)(20.0))(lab)
+    seen = set()
+    while lab.station.doses.running or lab.fault:
+        lab.wait(0.1)
+        seen.add(str(lab.fault))
+    assert any("broker" in fault for fault in seen)
+    assert not [fault for fault in seen if "plug" in fault]
+
+
 def test_short_runs_of_a_pump_do_not_pile_up_in_a_queue_that_is_dead(monkeypatch):
     lab = Lab(monkeypatch)
     lab.begin()

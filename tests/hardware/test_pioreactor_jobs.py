@@ -1,5 +1,6 @@
 """What a run keeps going on a unit: readings, stirring, thermostat and, after a hand-over, the vendor's turbidostat."""
 
+import json
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -357,6 +358,61 @@ def test_nothing_is_dosed_before_the_unit_told_a_pin_that_was_switched(monkeypat
     lab.until(lambda: lab.station._box.on() == [WASTE_PIN], 5.0)
     lab.wait(5.0)
     assert lab.given() == pytest.approx((0.5, 0.5), abs=0.02)
+
+
+@pytest.mark.parametrize("stirring", [True, False])
+def test_pins_that_are_told_no_more_hold_doses_after_two_of_them(monkeypatch, stirring):
+    lab = Lab(monkeypatch, stirring=stirring)
+    lab.begin()
+    doses = []
+    for blind in (False, True, True, True, True):
+        lab.sample()
+        lab.world.blind = blind
+        doses.append(lab.dose(0.5))
+        lab.wait(8.0)
+    assert doses == [0.5, 0.5, 0.5, 0.0, 0.0]
+    assert (lab.fault.kind, lab.fault.detail) == ("pump", UNHEARD)
+    assert lab.given() == pytest.approx((1.5, 1.5), abs=0.1)
+    lab.world.blind = False
+    lab.until(lambda: lab.fault is None, 20.0)
+    lab.sample()
+    assert lab.dose(0.5) == 0.5
+
+
+BELOW = "OD signal on channel 2 is below its stored blank (0.1 < 0.2). No OD reading was published."
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_reader_that_publishes_nothing_is_told_with_what_its_log_says(monkeypatch, first):
+    """From 26.11 on it publishes no reading below the blank, from the beginning or in a run."""
+    lab = Lab(monkeypatch)
+    if first:
+        lab.world.od_s = 1e9
+    lab.begin()
+    if not first:
+        lab.sample()
+        lab.world.od_s = 1e9
+    lab.wait(lab.station.unit.config.reading_s + 1.0)
+    said = {"task": "od_reading", "message": BELOW, "level": "ERROR"}
+    lab.world.say("logs/app/error", json.dumps({**said, "task": "stirring", "message": "no reading of the rpm"}))
+    lab.world.say("logs/app/error", json.dumps(said))
+    lab.until(lambda: lab.fault is not None, 60.0)
+    assert (lab.fault.kind, BELOW in lab.fault.detail) == ("stopped", True)
+    lab.world.od_s, lab.world.od_alive = 5.0, True
+    lab.world._read()
+    lab.until(lambda: lab.fault is None, 60.0)
+    lab.world.od_alive = False
+    lab.until(lambda: lab.fault is not None, 100.0)
+    assert BELOW not in lab.fault.detail, "it has read since"
+
+
+def test_a_web_server_that_does_not_answer_is_told_within_a_minute(lab):
+    lab.world.web = False
+    assert lab.until(lambda: lab.fault is not None, 60.0) > 10.0, "not every request that fails is a fault"
+    assert (lab.fault.kind, lab.fault.detail) == ("link", "http://pio01.local: refused")
+    assert "pioreactor-web" in lab.fault.remedy
+    lab.world.web = True
+    lab.until(lambda: lab.fault is None, 30.0)
 
 
 def test_a_flow_is_read_from_every_kind_of_curve():

@@ -99,6 +99,13 @@ def test_what_was_turned_away_was_not_heard_and_of_an_error_that_is_not_known(se
     assert isinstance(found.value, NotHeard) == (raised is NotHeard)
 
 
+def test_an_error_of_the_web_server_is_told_in_its_words_with_what_helps_and_no_page_for_people(server):
+    server.status, server.body = 503, b"<!DOCTYPE html>\n<html><h1>503</h1></html>"
+    with pytest.raises(ProtocolError, match=r"status 503: Service Unavailable; .*restart pioreactor-web") as found:
+        Web(server.url).get("/active_calibrations")
+    assert "<" not in str(found.value)
+
+
 @pytest.mark.parametrize("body", [b"", b"[]", b"<html>", b"[" * 100_000, b'{"task_id": 3}', b"\xff\xfe", b"null"])
 def test_an_answer_that_is_none_is_named_and_may_have_been_heard(server, body):
     server.status, server.body = 202, body
@@ -114,8 +121,9 @@ def test_nobody_there_was_not_heard_and_one_who_is_silent_may_have(server):
         with pytest.raises(NotHeard):
             Web(f"http://127.0.0.1:{taken.getsockname()[1]}").run("add_media", {"ml": 0.5})
     server.status = 0
-    with pytest.raises(LinkError) as found:
+    with pytest.raises(LinkError, match="the unit's power and network") as found:
         Web(server.url, timeout_s=0.3).run("add_media", {"ml": 0.5})
+    assert "board" not in str(found.value), "words of another family"
     assert not isinstance(found.value, NotHeard)
 
 
