@@ -69,8 +69,8 @@ class Doses:
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
         self._ran_s, self._strange_ml = {MEDIA: 0.0, WASTE: 0.0}, {MEDIA: 0.0, WASTE: 0.0}
-        self._booked_ml = self._taken_ml = self._ran_on_ml = self._net_ml = self._spilled_ml = 0.0  # of a dose
-        self._known_ml, self._rest_ml = np.zeros(3), np.zeros(3)  # fed at most, at least, risen, beyond what is booked
+        self._now_ml, self._told_ml = np.zeros(3), np.zeros(3)  # fed at most, at least, risen: in truth, and booked
+        self._base_ml, self._taken_ml, self._ran_on = np.zeros(2), 0.0, False  # fed before this dose; of this dose
 
     @property
     def running(self) -> bool:
@@ -81,7 +81,8 @@ class Doses:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
         if history.open:
-            self._course = self._drained(self._look_for(history), history.feed_ml, history.id)
+            plan = Plan(history.feed_ml, history.waste_ml)
+            self._course = self._drained(self._look_for(history, plan), plan, history.id)
 
     def plan(self, rate: float) -> Plan:
         """Plan the dose of a mean rate, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
@@ -109,7 +110,7 @@ class Doses:
             doses=self._count, on_s=on_s, id=dose,
         )  # fmt: skip
         if dosing:
-            self._course = self._drained(self._dose(plan, dose, on_s), plan.feed_ml, dose)
+            self._course = self._drained(self._dose(plan, dose, on_s), plan, dose)
             self.work()
         return plan
 
@@ -128,7 +129,7 @@ class Doses:
             self._settle_pins()
             if job := next((job for job in (MEDIA, WASTE) if self.pumps.odd(job)), ""):
                 name = f"{self.pumps.short}/{self._book.elapsed():.0f}"
-                self._course = self._drained(self._silence(job, name), 0.0, name)
+                self._course = self._drained(self._silence(job, name), Plan(), name)
         if self._course is None or self._clock.now() < self._due:
             return
         try:
@@ -153,105 +154,86 @@ class Doses:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(MEDIA, plan.feed_ml, dose)), Moved()
-        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (self.pumps.halted or self._ran_on_ml):
+        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (self.pumps.halted or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
-        yield from self._conclude(plan, dose, on_s, media, waste)
+        self._conclude(plan, dose, on_s, media, waste)
 
-    def _look_for(self, history: History) -> Iterator[float]:
+    def _look_for(self, history: History, plan: Plan) -> Iterator[float]:
         """Look for the dose an earlier life left open: what became of it while nobody watched, and what still may."""
-        pumps, dose, asked_ml = self.pumps, history.id, history.feed_ml
+        pumps, dose, asked_ml = self.pumps, history.id, plan.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
             pumps.counted[MEDIA, dose] = pumps.counted[WASTE, dose] = math.inf
-            media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, history.waste_ml)
+            media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, plan.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
                 ago_s = pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
                 asked_s, ran_s = self._clock.now() - ago_s, pumps.pin(MEDIA).ran_s
                 seen = yield from pumps.follow(Request(MEDIA, asked_ml, dose, asked_s, ran_s, history.task))
                 end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
                 media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
-        yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
+        self._conclude(plan, dose, history.on_s, media, waste)
 
-    def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
+    def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
         """Conclude a dose: record its end, then correct what was booked since it began."""
         self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
         for moved, pump in ((media, "media"), (waste, "waste")):
             if moved.end:
                 self._book.tell(f"{pump}: {moved.end}")
-        high_ml, end = waste.high + self._taken_ml, media.end or waste.end
-        self._taken_ml += waste.low
-        row = Ending(on_s, media.high, self._taken_ml, feed_low_ml=media.low).row()
-        self._book.log("dose_end", **row, waste_high_ml=high_ml, id=dose, end=end)
-        self._over(media, plan.feed_ml)
-        yield from ()
+        taken_ml, end = self._taken_ml, media.end or waste.end
+        row = Ending(on_s, media.high, taken_ml + waste.low, feed_low_ml=media.low).row()
+        self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=end)
+        self._ran_on = self._ran_on or media.high > plan.feed_ml + LATE_ML
+        self._fed(media.high, media.low, waste.low)
 
-    def _over(self, media: Moved, booked_ml: float) -> None:
-        """Count what a media pump gave that is off. Args: booked_ml: of it, with its waste, when it began."""
-        if self._ran_on_ml or media.high > booked_ml + LATE_ML:
-            self._ran_on_ml = media.high
-        self._net_ml -= booked_ml + self._spilled_ml  # its waste counts as it was taken; less may have run over
-        self._account(media.high - booked_ml, media.low - booked_ml)
-
-    def _account(self, more_ml: float, less_ml: float) -> None:
-        """Count what was fed, at most and at least, beyond what was booked when it began, and what the vial has of it.
-
-        Little is booked once it is much.
-        """
-        net_ml = self._booked_ml + more_ml - self._taken_ml
-        rise_ml = max(self._known_ml[2] + net_ml - self._net_ml, 0.0)
-        self._spilled_ml += max(rise_ml - self._room_ml, 0.0)
-        known_ml = np.array([more_ml, less_ml, min(rise_ml, self._room_ml)])
-        self._rest_ml += known_ml - self._known_ml
-        self._known_ml, self._net_ml = known_ml, net_ml
-        if np.abs(self._rest_ml).max() > LATE_ML:
-            more, less, rise = self._rest_ml.tolist()
+    def _fed(self, high_ml: float, low_ml: float, taken_ml: float = 0.0) -> None:
+        """Count what this dose fed up to now, and what was taken since; little is booked once it is much."""
+        fed_ml = self._base_ml + np.array([high_ml, low_ml])
+        rise_ml = min(self._now_ml[2] + max(fed_ml[0] - self._now_ml[0], 0.0), self._room_ml)
+        self._now_ml = np.array([*fed_ml, max(rise_ml - taken_ml, 0.0)])
+        rest_ml = self._now_ml - self._told_ml
+        if np.abs(rest_ml).max() > LATE_ML:
+            more, less, rise = rest_ml.tolist()
             self.extra.append(Given(self._book.elapsed(), more, less, more - rise))
-            self._rest_ml = np.zeros(3)
+            self._told_ml = self._now_ml
 
-    def _drained(self, course: Iterator[float], booked_ml: float, name: str) -> Iterator[float]:
+    def _drained(self, course: Iterator[float], plan: Plan, name: str) -> Iterator[float]:
         """Go through a dose, and drain the vial beside and after it of what a media pump gives that runs on.
 
-        What it may have given is booked as it flows. Args: booked_ml: when the dose began. name: of the drains.
+        What it may have given is booked as it flows. Args: plan: what was booked when it began. name: of the drains.
         """
-        self._booked_ml = self._net_ml = booked_ml
-        self._taken_ml = self._ran_on_ml = self._spilled_ml = self.pumps.flowed_ml = 0.0
-        self._known_ml = np.zeros(3)
-        over, portion, number, after = False, None, 0, 0
+        self._base_ml, self._taken_ml, self._ran_on, self.pumps.flowed_ml = self._now_ml[:2], 0.0, False, 0.0
+        rise_ml = max(self._told_ml[2] + plan.feed_ml - plan.waste_ml, 0.0)
+        self._told_ml = np.array([*(self._told_ml[:2] + plan.feed_ml), rise_ml])
+        pumps, over, portion, number, left = self.pumps, False, None, 0, DRAINS
         while True:
             over = over or next(course, None) is None
-            more_ml, less_ml = self._known_ml[:2].tolist()
-            self._account(more_ml if over else max(more_ml, self.pumps.flowed_ml - booked_ml), less_ml)
-            if portion is None and after < DRAINS and (wanted_ml := self._surplus(over)) > 0.0:
-                portion, number, after = self._portion(wanted_ml, f"{name}/drain{number}"), number + 1, after + over
+            if not over and (pumps.runs_on or pumps.flowed_ml > plan.feed_ml + LATE_ML):
+                self._fed(max(pumps.flowed_ml, plan.feed_ml, self._now_ml[0] - self._base_ml[0]), 0.0)
+            twice = self._config.waste_factor
+            wanted_ml = twice * self._now_ml[2] if over else 0.5 * (twice * pumps.flowed_ml - self._taken_ml)
+            due = wanted_ml > (LATE_ML if over else 0.5 * DRAIN_ML * self._ran_on) and not pumps.halted
+            if portion is None and left and due and (self._ran_on if over else pumps.runs_on):
+                wanted_ml, self._ran_on, left = max(wanted_ml, DRAIN_ML * (not over)), True, left - over
+                portion, number = self._portion(wanted_ml, f"{name}/drain{number}"), number + 1
             if over and portion is None:
                 return
             if portion is not None and next(portion, None) is None:
                 portion = None
             yield STEP_S
 
-    def _surplus(self, over: bool) -> float:
-        """Return what the waste pump is to take next of what a media pump gives that runs on, or (over) ran on, mL."""
-        pumps, factor = self.pumps, self._config.waste_factor
-        if over:
-            wanted_ml = factor * self._known_ml[2]
-            due = self._ran_on_ml > 0.0 and wanted_ml > LATE_ML
-        else:
-            wanted_ml = factor * pumps.flowed_ml - self._taken_ml
-            due = pumps.runs_on and pumps.flowed_ml > 0.0 and (wanted_ml > DRAIN_ML or not self._ran_on_ml)
-            self._ran_on_ml, wanted_ml = max(self._ran_on_ml, due * pumps.flowed_ml), max(0.5 * wanted_ml, DRAIN_ML)
-        return wanted_ml if due and not pumps.halted else 0.0
-
     def _portion(self, ml: float, name: str) -> Iterator[float]:
         """Have the waste pump take a portion; it counts as it is told, and in the end as it is known."""
-        before_ml, course = self._taken_ml, self.pumps.give(WASTE, ml, name)
+        before_ml, course, over = self._taken_ml, self.pumps.give(WASTE, ml, name), False
         self._book.tell(f"{ml:.1f} mL of waste: the vial is drained of what the media pump gives that runs on")
-        while True:
+        while not over:
+            taken_ml = self.pumps.reported.get((WASTE, name), 0.0)
             try:
                 yield next(course)
             except StopIteration as ended:
-                self._taken_ml = before_ml + ended.value.low
-                return
-            self._taken_ml = before_ml + self.pumps.reported.get((WASTE, name), 0.0)
+                taken_ml, over = ended.value.low, True
+            more_ml, self._taken_ml = before_ml + taken_ml - self._taken_ml, before_ml + taken_ml
+            high_ml, low_ml = self._now_ml[:2] - self._base_ml
+            self._fed(high_ml, low_ml, more_ml)
 
     # -- what nobody commanded -------------------------------------------------------------------------------------
 
@@ -261,9 +243,11 @@ class Doses:
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
-            self._give(job, moved.low, moved.high, f"{job} ran without its job", booked=job == MEDIA)
+            self._give(job, moved.low, moved.high, f"{job} ran without its job")
         if job == MEDIA:
-            self._over(moved, 0.0)
+            self._ran_on = self._ran_on or moved.high > LATE_ML
+            self._told_ml = self._told_ml + np.array([moved.high, moved.low, moved.high])
+            self._fed(moved.high, moved.low)
 
     def _settle_pins(self) -> None:
         """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too.
@@ -299,12 +283,10 @@ class Doses:
         self.foreign = f"{job} of {ml:.2f} mL without our command ({who})"
         self._give(job, ml, ml, self.foreign, beside_ml)
 
-    def _give(
-        self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0, booked: bool = False
-    ) -> None:
-        """Record what a pump moved beside our doses: when noticed, how much, by whom. Args: booked: elsewhere."""
+    def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
+        """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
         fed = job != WASTE
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, beside_ml if fed else high_ml)
-        self.extra += [] if booked else [given]
+        self.extra.append(given)
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
         self._book.log("given", **given.row(why))

@@ -320,7 +320,7 @@ class Pumps:
                 self.trouble = f"pin {number} {runs} on after {job}, {how}; {remedy}"
             self.waits = late or self.waits
             if job == MEDIA:
-                self.flowed_ml, self.runs_on = flowed_ml, late or (self.lost(job) and pin.on)
+                self.flowed_ml, self.runs_on = flowed_ml, flowed_ml > 0.0 and (late or (self.lost(job) and pin.on))
             yield STEP_S
         self.trouble, self.waits, self.runs_on = "", False, False
         self.proven[job] = self.clock.now()

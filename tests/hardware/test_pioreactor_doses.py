@@ -343,9 +343,8 @@ def test_a_run_without_a_thermostat_is_resumed_from_its_journal_on_the_disk(monk
 def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     lab = Lab(monkeypatch)
     lab.world.queue = False
-    past = History(
-        boot="boot1", sample=(1.0, 1), doses=1, open=True, fed=True, id="turbidostat/run/pio01/1", feed_ml=0.5
-    )
+    asked = {"id": "turbidostat/run/pio01/1", "feed_ml": 0.5, "waste_ml": 1.0}
+    past = History(boot="boot1", sample=(1.0, 1), doses=1, open=True, fed=True, **asked)
     lab.begin(past)
     lab.wait(30.0)
     assert not lab.of("dose_end")
