@@ -417,7 +417,9 @@ class ForcedEnd:
         if not is_off(self._look()):
             return math.nan
         if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
-            pin.ends(max(min(self._quiet_s, now), self._since))
+            pin.ends(booted_s := max(min(self._quiet_s, now), self._since))
+            if self._untold:
+                return booted_s  # whoever told it off before did not know that it was on
         return pin.off_s if pin.off_s >= self._since else now
 
     @property

@@ -110,6 +110,9 @@ WRONG = {
     "killed before it told its pin": Wrong(killed(0.01, mute=True), 70.0, unlock, "pwm_locks 13"),
     "killed before its unit knew": Wrong(UNKEPT, 70.0, unlock, "pwm_locks 13"),
     "killed before its unit knew, and rebooted": Wrong(UNKEPT, 70.0, both(cut, power), "pwm_locks 13"),
+    "killed before its unit knew, not drained, and rebooted": Wrong(
+        both(UNKEPT, lambda lab: lab.world.locks.add(WASTE_PIN)), 70.0, both(cut, power), "pwm_locks 13"
+    ),
     "killed, and rebooted as a drain begins": Wrong(
         killed(0.2), 30.0, both(cut_as_a_drain_begins, power), "pwm_locks 13"
     ),
