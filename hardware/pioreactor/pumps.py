@@ -364,7 +364,7 @@ class ForcedEnd:
         self._from_s = max(request.asked_s, told_s if told_s < math.inf else -math.inf)
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
-        self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
+        self._quiet_s = self._still_s = math.inf
         self._short: Future[str] | None = None
         self._rebooted = self.lost = self._held = False
 
@@ -402,7 +402,6 @@ class ForcedEnd:
         if told and not pin.on and not self._untold:
             self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
-            self._rows_s = p.clock.now()
             self._listed = any(row["job_name"] == self._job for row in rows[0])
             self._rebooted = not self._listed and p.rebooted(rows[0])
             p.boot = boot_of(rows[0]) if self._rebooted else p.boot
@@ -434,7 +433,8 @@ class ForcedEnd:
         0 for the pump of a silent unit, and for one whose bottle is empty by now.
         """
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
-        silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self.lost
+        silent = self._listed is None or now > self._calls.failed.get("rows", (now, ""))[0] + QUIET_S
+        broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
         flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
         return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0

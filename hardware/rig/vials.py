@@ -117,7 +117,6 @@ class _Vial:
             "peak_ml": self.peak_ml,
             "fed_ml": float(self.plant.feed.delivered_ml[0]),
             "duty": {str(pin): duty for pin, duty in self.duty.items()},
-            "doses": len([p for p in self.pulses if p.pump == "media"]),
             "temperature": float(self.plant.thermal.temperature[0]),
         }
 

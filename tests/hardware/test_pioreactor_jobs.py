@@ -463,7 +463,7 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     assert {name for name, check in checks.items() if not check.ok and check.required} == {
         "identity", "experiment", "photodiode", "scale", "wiring", "client", "dosing",
     }  # fmt: skip
-    assert {name for name, check in checks.items() if not check.ok and not check.required} == {"version", "clock"}
+    assert {name for name, check in checks.items() if not check.ok and not check.required} == {"version"}
     assert checks["identity"].detail == "the unit at http://pio02.local is pio09"
     assert checks["experiment"].detail == "it is in the experiment older, backend.experiment = turbidostat"
     assert checks["photodiode"].detail == "2 of 1 at 90 degrees, 3 at 135 degrees"
@@ -473,7 +473,6 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     assert checks["client"].remedy == "clear it"
     pumps = [checks[f"{pump}_pump"].detail for pump in ("media", "waste")]
     assert pumps == ["0.700 mL/s at its calibrated duty", "1.600 mL/s at its calibrated duty"]
-    assert "ours is 1.2 mL" in checks["dead man"].detail
     assert checks["volume"].detail == "not set mL in its settings, 14 here"
 
 

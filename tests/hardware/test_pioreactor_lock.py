@@ -116,6 +116,7 @@ def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
     assert holds(lambda: other.holder("pio01") != "")
     first._client.socket().shutdown(2)  # the broker sends the last will
     assert holds(lambda: first.broke_s > 0.0 and first.connected)
+    assert "closed" in first.lost
     assert holds(lambda: other.holder("pio01") != "")
     first.close()
     other.close()
