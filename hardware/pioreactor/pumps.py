@@ -305,22 +305,20 @@ class Pumps:
         job, ending, pin = request.job, ForcedEnd(self, request), self.pin(request.job)
         while math.isnan(off_s := ending.off_s()):
             ending.act()
-            late, flowed_ml = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
-            if late and self.broke(request) and not ending.lost:
-                self.trouble = (
-                    f"the broker was lost in {job}, which ends with it; whether its pump is off is being verified"
-                )
+            late = self.clock.now() > ending.began + OVERRUN_S
+            told_on = pin.on and self.mqtt.broke_s < self.box.dc_s < self.clock.now() - SETTLE_S  # by no short run
+            if late and self.broke(request) and not (ending.lost or told_on):
+                self.trouble = f"the broker was lost in {job}, which ends with it; its pump is being verified off"
             elif late:
                 number, unlock = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
                 how = "whose process was killed or stands still" if ending.lost else "which should have ended"
-                runs, pull = ("runs", "pull") if pin.on else ("may run", "look at the pump; if it runs, pull")
-                remedy = (
-                    f"{pull} the pump's plug, or on the unit: {unlock} {number} --as-int (it is then ended from here)"
-                )
-                self.trouble = f"pin {number} {runs} on after {job}, {how}; {remedy}"
+                plug = "pull the pump's plug" if pin.on else "look at the pump; if it runs, pull its plug"
+                remedy = f"{plug}, or on the unit: {unlock} {number} --as-int (it is then ended from here)"
+                self.trouble = f"pin {number} {'runs' if pin.on else 'may run'} on after {job}, {how}; {remedy}"
             self.waits = late or self.waits
             if job == MEDIA:
-                self.flowed_ml, self.runs_on = flowed_ml, flowed_ml > 0.0 and (late or (self.lost(job) and pin.on))
+                self.flowed_ml = ending.flowed()
+                self.runs_on = self.flowed_ml > 0.0 and (late or (self.lost(job) and pin.on))
             yield STEP_S
         self.trouble, self.waits, self.runs_on = "", False, False
         self.proven[job] = self.clock.now()
