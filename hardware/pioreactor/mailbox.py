@@ -167,7 +167,7 @@ class Mailbox:
         elif rest == "od_reading/ods" and mine and payload:
             self._reading(json.loads(payload), now, retained)
         elif rest.startswith("logs/") and rest.endswith("/error") and mine and not retained:
-            if (said := json.loads(payload))["task"] == "od_reading":
+            if (said := json.loads(payload)).get("task") == "od_reading":
                 self.complaint = " ".join(str(said["message"]).split())[:200]
         elif rest == "temperature_automation/temperature" and mine and payload:
             self.temperature = _number(json.loads(payload)["temperature"])

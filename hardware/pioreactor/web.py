@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from http import HTTPStatus
+from http.client import responses
 from typing import Any, TypeVar
 from urllib.parse import quote
 
@@ -117,7 +117,7 @@ class Web:
             return answer
         reason = answer.get("error", answer) if isinstance(answer, dict) else answer
         if str(reason).lstrip().startswith("<"):  # a page for people
-            reason = HTTPStatus(status).phrase
+            reason = responses.get(status, "a page")
         text = f"{url}: its web server answered with status {status}: {' '.join(str(reason).split())[:160]}"
         raise NotHeard(text) if 400 <= status < 500 else ProtocolError(f"{text}; {REMEDY}")
 

@@ -99,9 +99,10 @@ def test_what_was_turned_away_was_not_heard_and_of_an_error_that_is_not_known(se
     assert isinstance(found.value, NotHeard) == (raised is NotHeard)
 
 
-def test_an_error_of_the_web_server_is_told_in_its_words_with_what_helps_and_no_page_for_people(server):
-    server.status, server.body = 503, b"<!DOCTYPE html>\n<html><h1>503</h1></html>"
-    with pytest.raises(ProtocolError, match=r"status 503: Service Unavailable; .*restart pioreactor-web") as found:
+@pytest.mark.parametrize(("status", "words"), [(503, "Service Unavailable"), (520, "")])
+def test_an_error_of_the_web_server_is_told_in_its_words_with_what_helps_and_no_page_for_people(server, status, words):
+    server.status, server.body = status, b"<!DOCTYPE html>\n<html><h1>503</h1></html>"
+    with pytest.raises(ProtocolError, match=rf"status {status}: {words}.*; .*restart pioreactor-web") as found:
         Web(server.url).get("/active_calibrations")
     assert "<" not in str(found.value)
 
