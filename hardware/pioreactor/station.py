@@ -15,8 +15,7 @@ from hardware.pioreactor.mailbox import AUTOMATIONS
 from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, boot_of
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
-from hardware.pioreactor.versions import TESTED, facts
-from hardware.pioreactor.web import REMEDY
+from hardware.pioreactor.versions import facts
 from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
 
@@ -28,7 +27,6 @@ SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
 UNHEARD = "the unit told nothing of its pins when one was switched, so no dose could be followed"
-SHOW_PINS = f"stop and start stirring in the vendor's page, else reboot the unit; tried with {', '.join(TESTED)}"
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
@@ -192,8 +190,8 @@ class Station:
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
         if not self._mqtt.connected:
-            why = f"no MQTT broker at {self._config.broker}: {self._mqtt.lost or 'nothing comes'}"
-            return Fault("link", why, "on the leader: power, network, sudo systemctl restart mosquitto; doses wait")
+            lost = f"no MQTT broker at {self._config.broker}: {self._mqtt.lost or 'nothing comes'}"
+            return Fault("link", lost, "on the leader: power, network, sudo systemctl restart mosquitto; doses wait")
         if self._pumps.trouble:
             return Fault("pump", self._pumps.trouble, "nothing is dosed until that is known")
         if other := self._mqtt.holder(self.name):
@@ -212,17 +210,18 @@ class Station:
             twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
             again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
             remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
-            detail = f"the unit {GONE[job]}"
-            if job == OD and self._box.complaint:
-                detail, remedy = f"{detail}, its log says: {self._box.complaint}", "do what that says; doses wait"
-            elif self._real.now() > self._box.heard_s + SILENT_S:
-                detail += ", and nothing else comes from it by MQTT: look at its power and network"
-            return Fault("stopped", detail, remedy)
+            if job == OD and (said := self._box.complaint):
+                return Fault("stopped", f"the unit {GONE[job]}, its log says: {said}", "do what that says; doses wait")
+            if self._real.now() > self._box.heard_s + SILENT_S:
+                return Fault(
+                    "stopped", f"the unit {GONE[job]}, nor says anything", f"look at its power and network; {again}"
+                )
+            return Fault("stopped", f"the unit {GONE[job]}", remedy)
         if math.isinf(self._box.dc_s):
-            return Fault("pump", UNHEARD, SHOW_PINS)
+            return Fault("pump", UNHEARD, "stop and start stirring in the vendor's page, else reboot the unit")
         since_s, why = self._calls.failed.get("rows", (math.inf, ""))
-        what, _, remedy = why.partition("; ")
-        return Fault("link", what, remedy or REMEDY) if self._real.now() > since_s + GRACE_S else None
+        late = self._real.now() > since_s + GRACE_S
+        return Fault("link", f"its web server: {why}", "doses wait") if late else None
 
     def _wanted(self) -> list[str]:
         """List the jobs that this run keeps going."""
@@ -311,11 +310,11 @@ class Station:
                 or any(box.live(job) or pumps.odd(job) for job in (MEDIA, WASTE))
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
-                    seen, do = "not verified off", "look at its pumps; pull the plug of one that runs"
+                    seen = "not verified off; look at its pumps, pull the plug of one that runs"
                     if box.on() or any(map(pumps.odd, (MEDIA, WASTE))):
-                        seen, do = f"pin {(*box.on(), 'of a killed job')[0]} on", "pull the plug of its pumps"
+                        seen = f"pin {(*box.on(), 'of a killed job')[0]} on; pull the plug of its pumps"
                     why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"
-                    raise DeviceStateError(f"pumps of {self.name}: {seen}; {do}. {why}")
+                    raise DeviceStateError(f"pumps of {self.name}: {seen}. {why}")
                 self.go_on()
                 yield STEP_S
         finally:

@@ -12,7 +12,7 @@ import httpx
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import fetch
 
-__all__ = ["REMEDY", "NotHeard", "Web"]
+__all__ = ["NotHeard", "Web"]
 
 T = TypeVar("T")
 
@@ -104,9 +104,11 @@ class Web:
         try:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
         except LinkError as error:
-            text = f"{str(error).partition('; ')[0]}; check the unit's power and network; {REMEDY}"
             nobody = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
-            raise (NotHeard if nobody else LinkError)(text) from error
+            what, _, _ = str(error).partition("; ")  # and words of another family
+            raise (NotHeard if nobody else LinkError)(
+                f"{what}; check the unit's power and network, {REMEDY}"
+            ) from error
         try:
             answer = json.loads(said or b"null")
         except (ValueError, RecursionError):
