@@ -37,7 +37,6 @@ LESS = {
     "tests.campaigns.rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
     "experiments.train": ["agent.total_steps=300", "agent.learn_start=100", "n_agents=2"],
     "tests.studies.ablate": ["agent.total_steps=300", "n_agents=2"],
-    "tests.studies.degradation": ["agent.total_steps=600", "n_agents=2"],
     "experiments.benchmark": ["replicates=1", "train_seeds=1"],
     "tests.campaigns.faults": ["controls=0", "moments=[dose]", "faults=[feed weak]"],
     "tests.campaigns.kills": ["kills=2", "runs=1"],

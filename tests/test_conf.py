@@ -28,7 +28,7 @@ from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
-from tests.studies.variants import variant
+from tests.studies.ablate import variant
 
 CONF = Path(__file__).parents[1] / "conf"
 

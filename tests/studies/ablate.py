@@ -15,21 +15,32 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import check, part, setting
+from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.training.config import TrainConfig
 from tests.entry import command
 from tests.studies.results import leave, write_csv
-from tests.studies.variants import seeds, variant
 
-__all__ = ["AblateConfig", "Row", "main", "summarise"]
+__all__ = ["AblateConfig", "Row", "main", "summarise", "variant"]
 
 log = logging.getLogger(__name__)
 
 MEASURES = ("regret_pct", "steady_abs_error", "regret_pct_last", "steady_abs_error_last")
 COLUMNS = ("variant", "seeds", "regret, %", "steady error, OD", "last regret, %", "last steady error, OD", "time, s")
+
+
+def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
+    """`agent` with some values replaced.
+
+    Raises: ValueError naming the variant and the key that does not exist or is out of range.
+    """
+    where = f"ablations.{name}"
+    try:
+        return build(agent, values, where)
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -162,8 +173,14 @@ def draw(rows: list[Row], folder: Path) -> None:
     )
     canvas, axes = charts.new_figure(11.0, 1.4 + 0.27 * len(names), 1, len(panels), sharey=True)
     for ax, (measure, label, limit) in zip(axes, panels, strict=True):
-        own = {name: np.array([getattr(row, measure) for row in rows if row.ablation == name]) for name in names}
-        seeds(ax, own, label)
+        jitter = np.random.default_rng(0)
+        for height, name in enumerate(names):
+            own = np.array([getattr(row, measure) for row in rows if row.ablation == name])
+            places = height + jitter.uniform(-0.22, 0.22, own.size)
+            ax.plot(np.maximum(own, 1e-4), places, ".", color=charts.COLOURS[0], alpha=0.45, markersize=5)
+            ax.plot([np.median(own)] * 2, [height - 0.34, height + 0.34], color=charts.COLOURS[1], linewidth=2)
+        ax.set(xscale="log", xlabel=label, ylim=(len(names) - 0.5, -0.5))
+        ax.set_yticks(range(len(names)), names, fontsize=8)
         ax.axvline(limit, color=charts.COLOURS[6], linewidth=1, linestyle="--")
     charts.save(canvas, folder / "figures", "ablation")
 

@@ -10,8 +10,7 @@ import pytest
 
 from dqn.config import DQNConfig
 from experiments.cli import frame
-from tests.studies.ablate import AblateConfig, Row, ablate, main, summarise
-from tests.studies.variants import variant
+from tests.studies.ablate import AblateConfig, Row, ablate, main, summarise, variant
 
 pytestmark = pytest.mark.numeric
 
