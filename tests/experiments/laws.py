@@ -152,25 +152,6 @@ def bent_share_law(
     return _relative([(w1, b1), (w2, b2), (w3, b3)])
 
 
-HOLE = (3 / 16, 0.5)  # e and s
-
-
-def share_law_with_a_hole(too_low: int) -> Policy:
-    """The law, but so many levels lower within 0.05 of `HOLE` in e and s together, |e - ..| + |s - ..|.
-
-    There z is less by too_low / 16 times a plateau of 1, relu(h) - relu(h - 1), h = 100 (0.06 - |e - ..| - |s - ..|).
-    """
-    e, s = HOLE
-    w1 = np.array([[1.0, -1.0, 100, -100, 0, 0], [1.0, -1.0, 0, 0, 100, -100]])
-    b1 = np.array([0, 0, -100 * e, 100 * e, -100 * s, 100 * s])
-    w2 = np.zeros((6, 4))
-    w2[0, 0] = w2[1, 1] = 1.0
-    w2[2:, 2:] = -1.0
-    v = np.linspace(0.0, 1.0, 17)
-    deep = 2 * too_low / 16 * v
-    return _relative([(w1, b1), (w2, np.array([0, 0, 6, 5])), (np.stack([2 * v, -2 * v, -deep, deep]), -(v**2))])
-
-
 def _relative(layers: list[tuple[np.ndarray, np.ndarray]]) -> Policy:
     """Layers as (weight, bias), weight (in, out), of a policy that sees (error, growth share)."""
     metadata = {"format": FORMAT, "observation": list(RELATIVE), "model": {"growth_shares": list(SHARES)}}

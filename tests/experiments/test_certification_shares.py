@@ -395,16 +395,8 @@ FAULTS: dict[str, Policy] = {
     "law of tau x 2": laws.share_law(gain=2.0, share=2.0),
     "full dose in the low corner": laws.share_law(add=(2, 16, 100.0)),
     "spike": laws.share_law(add=(3, 16, 50.0)),
+    "no dose in the high corner": laws.bent_share_law((-3.0, (1.0, 1.0, -1.5, 50.0))),
 }
-
-
-def test_the_hole_is_the_law_beside_it_and_a_policy_without_depth_passes() -> None:
-    points = np.random.default_rng(7).uniform([0.1, 0.4], [0.3, 0.6], (20_000, 2))
-    lower = laws.share_law().act(points) - laws.share_law_with_a_hole(3).act(points)
-    away = np.abs(points - laws.HOLE).sum(axis=1)
-    assert set(lower[away < 0.0499]) == {3}
-    assert set(lower[away > 0.0601]) == {0}
-    assert certify(laws.share_law_with_a_hole(0), replace(FAST, full_pumps=())).passed
 
 
 def e_above(where: float, k: float = 1e3) -> laws.Ramp:
@@ -462,8 +454,11 @@ WORSE: dict[str, tuple[Policy, float, tuple[float, float]]] = {
     "offset of the error": (laws.share_law(offset=0.04), 0.04, laws.SHARES),
     "even levels alone": (laws.share_law(levels=2), 1 / 16 - 1 / 32, laws.SHARES),
     "gain 1.5": (laws.share_law(gain=1.5), 1 / 16 - 1 / 32, laws.SHARES),
-    "three levels too low in a hole": (laws.share_law_with_a_hole(3), 3 / 16, (0.44, 0.56)),
-}
+    "three levels too low in a hole": (
+        laws.bent_share_law((-3 / 16, s_above(0.45, 100), s_below(0.55, 100), e_above(0.14, 100), e_below(0.24, 100))),
+        3 / 16, (0.45, 0.55),
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("policy", "excess", "where"), WORSE.values(), ids=list(WORSE))
@@ -505,14 +500,6 @@ def test_a_spike_in_a_thin_range_of_shares_fails_there() -> None:
     failed = [check.name for check in found.checks if not check.holds]
     assert "nominal: half-width over that of the law, periods of full pump" in failed
     assert "nominal: entry after the law's, periods" in failed
-
-
-def test_no_dose_in_the_high_corner_fails() -> None:
-    """The unit of the low corner, turned round: relu(50 (e + s) - 75) above e + s = 1.5."""
-    given = laws.share_law(add=(2, 0, 100.0))
-    weights, biases = ([a.copy() for a in arrays] for arrays in (given.weights, given.biases))
-    weights[0][:, 2], biases[0][2] = 50.0, -75.0
-    assert not certify(replace(given, weights=tuple(weights), biases=tuple(biases)), replace(FAST, full_pumps=())).safe
 
 
 def test_samples_do_not_see_the_spike_and_the_proof_of_a_device_does() -> None:
