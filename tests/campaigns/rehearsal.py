@@ -158,6 +158,51 @@ class Rehearsal:
         self._dead = True
         raise Killed
 
+    def kill_at(
+        self, request: str, armed: Callable[[], bool] = lambda: True, after_s: float = 0.6, stops: bool = False
+    ) -> None:
+        """Kill the program so long after the first request that begins so, once `armed`; the device carries it out.
+
+        stops: it ends as on a signal.
+        """
+        whole = self.device.submit
+
+        def submit(method: str, path: str, *rest: Any) -> Any:
+            exchange = whole(method, path, *rest)
+            if path.startswith(request) and armed():
+                self.device.submit = whole  # type: ignore[method-assign]
+                self.clock.sleep(after_s)
+                if stops:
+                    raise KeyboardInterrupt
+                self.kill()
+            return exchange
+
+        self.device.submit = submit  # type: ignore[assignment, method-assign]
+
+    def kill_decided(self, when: Callable[[Step], bool]) -> None:
+        """Kill the program between a decision of which this is true and its record."""
+        decided = self.loop._before_dose
+        assert decided is not None
+
+        def dies(step: Step) -> None:
+            decided(step)
+            if when(step):
+                self.kill()
+
+        self.loop._before_dose = dies
+
+    def killed(self, until_s: float = np.inf) -> None:
+        """Run until something kills or stops the program, and close its files. Raises: AssertionError if nothing does."""
+        try:
+            list(self.run(until_s))
+        except Killed:
+            self.close()
+        except KeyboardInterrupt:
+            self.reactors.stop()
+            self.close()
+        else:
+            raise AssertionError("nothing ended it")
+
     def close(self) -> None:
         """Close the files of the program that has ended; `begin` starts the next one."""
         self.spans[-1][1] = self.clock.now()

@@ -18,8 +18,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
     """Twenty minutes of two reactors, all samples recorded."""
     r = Rehearsal(tmp_path_factory.mktemp("run"), rehearsed(("M0", "M1"), Scenario((0.5,), (20.0,), (37.0,))))
     r.begin()
-    for _ in r.run():
-        pass
+    list(r.run())
     r.reactors.stop()
     r.close()
     return r

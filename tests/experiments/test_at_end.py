@@ -21,8 +21,7 @@ def ended(folder: Path, **each: str) -> Rehearsal:
     config = rehearsed(("M0", "M1"), Scenario((0.4,), (70.0,), (37.0,)))
     run = Rehearsal(folder, replace(config, each={"M0": {"minutes": [10.0], **each}}), quiet(mu=0.03), od=0.4)
     run.begin()
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.loop.done.all()
     return run
 
@@ -62,15 +61,13 @@ def test_it_is_not_handed_over_by_a_sensor_that_is_not_believed(tmp_path: Path) 
     each = {"M0": {"minutes": [4.0], "at_end": "regulate"}}
     run = Rehearsal(tmp_path, replace(config, each=each), quiet(mu=0.03), od=0.4)
     run.begin()
-    for _ in run.run(190.0):
-        pass
+    list(run.run(190.0))
     inject(run.device, "spectrometer_dead", "M0", 1)
     for _ in run.run(480.0):
         assert not run.reactors.handed_over[0]
     assert run.loop.done[0]
     inject(run.device, "spectrometer_dead", "M0", 0)
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.reactors.handed_over.tolist() == [True, False]
 
 
@@ -78,8 +75,7 @@ def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path)
     config = replace(rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,))), at_end="regulate")
     run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
     run.begin()
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.reactors.handed_over.tolist() == [True]
 
 

@@ -29,7 +29,7 @@ from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
 from tests.campaigns.audit import audit_doses, audit_rows
 from tests.campaigns.killed_run import KillConfig, killed_run
-from tests.campaigns.rehearsal import SOUND, Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import SOUND, Rehearsal, rehearsed
 from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
 from tests.hardware.emulator_lab import quiet
@@ -93,9 +93,7 @@ def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
             assert now["controller"]["law"] == kept[-1]["composition"]["controller"]["law"]
             assert now["nearer_min"] == kept[-1]["composition"]["nearer_min"]
         run.clock.at(60.0 * minute, run.kill)
-        with pytest.raises(Killed):
-            list(run.run())
-        run.close()
+        run.killed()
         kept.append(json.loads((tmp_path / "state.json").read_text()))
         run.wait(away_s)
     run.begin()
@@ -128,20 +126,8 @@ def test_what_the_device_dosed_while_the_program_was_dead_is_told(
     monkeypatch.setattr(assemble, "_share", lambda config, plant, folder, scenarios: share(scenarios))
     run = rehearsal(tmp_path, SHORT)
     run.begin()
-    whole = run.device.submit
-
-    def submit(method: str, path: str, *rest: Any) -> Any:
-        exchange = whole(method, path, *rest)
-        if path.startswith("/SetOutputOn/Pump1/1/M0") and run.clock.now() > 1800.0:
-            run.device.submit = whole  # type: ignore[method-assign]
-            run.clock.sleep(0.3)
-            run.kill()
-        return exchange
-
-    run.device.submit = submit  # type: ignore[method-assign]
-    with pytest.raises(Killed):
-        list(run.run())
-    run.close()
+    run.kill_at("/SetOutputOn/Pump1/1/M0", lambda: run.clock.now() > 1800.0, 0.3)
+    run.killed()
     told = json.loads((tmp_path / "state.json").read_text())["composition"]["controller"]["law"]["told_ml"][0]
     run.wait(400.0)
     run.begin()

@@ -31,8 +31,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
     """A run that was killed after ten minutes."""
     run = Rehearsal(tmp_path_factory.mktemp("run"), rehearsed(("M0",), HOLD))
     run.begin()
-    for _ in run.run(600.0):
-        pass
+    list(run.run(600.0))
     run.close()
     return run
 

@@ -52,8 +52,7 @@ class Losable(Rehearsal):
         return exchange
 
     def live(self, minutes: float) -> None:
-        for _ in self.run(self.clock.now() + 60.0 * minutes):
-            pass
+        list(self.run(self.clock.now() + 60.0 * minutes))
 
     def data(self, name: str = "M0") -> dict[str, Any]:
         self.device.run_until(self.clock.now())

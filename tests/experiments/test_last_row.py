@@ -29,8 +29,7 @@ def test_what_was_repeated_after_the_last_row_is_in_it_and_once_however_often_th
         run.close()
         run.begin()
         assert float(run.loop.interlock.budget.fed_ml[0]) == pytest.approx(fed_ml, abs=1e-3), life
-        for _ in run.run(run.clock.now() + 180.0):
-            pass
+        list(run.run(run.clock.now() + 180.0))
         while not run.device.apps["M0"].data["Pump1"]["ON"]:
             run.loop.step()
     run.close()

@@ -37,22 +37,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
     """Twenty minutes of growth from 0.4, killed at the sixth decision and resumed."""
     made = Rehearsal(tmp_path_factory.mktemp("marks"), rehearsed(("M0",), SCHEDULE), quiet(mu=0.03), od=0.4)
     made.begin()
-    decided = made.loop._before_dose
-    assert decided is not None
-
-    def dies(step):  # type: ignore[no-untyped-def]
-        decided(step)
-        if step.elapsed[0] > 5.0:
-            made.kill()
-
-    made.loop._before_dose = dies
-    with pytest.raises(Killed):
-        for _ in made.run():
-            pass
-    made.close()
+    made.kill_decided(lambda step: bool(step.elapsed[0] > 5.0))
+    made.killed()
     made.begin()
-    for _ in made.run():
-        pass
+    list(made.run())
     return made
 
 

@@ -15,7 +15,7 @@ from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import LinkError
 from hardware.link.transport import SwitchedOff
 from hardware.storage.journal import read_journal
-from tests.campaigns.rehearsal import Killed, Rehearsal, StandIn, rehearsed
+from tests.campaigns.rehearsal import Rehearsal, StandIn, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"
@@ -42,38 +42,15 @@ class Full(Rehearsal):
 
 
 class Cut(Full):
-    """One reactor at full feed; the program ends at the first request of a kind after some minutes.
+    """One reactor at full feed; the program ends at the first request of a kind after some minutes."""
 
-    how: "kill", or "stop" as on a signal.
-    """
-
-    def __init__(self, folder: Path, request: str, how: str = "kill") -> None:
+    def __init__(self, folder: Path, request: str, stops: bool = False) -> None:
         super().__init__(folder)
-        self._request, self._how, self._whole = request, how, self.device.submit
         self.begin()
-        with pytest.raises((Killed, KeyboardInterrupt)):
-            self._until_cut()
-        if how == "stop":
-            self.reactors.stop()
+        list(self.run(300.0))
+        self.kill_at(request, stops=stops)
+        self.killed(900.0)
         self.died_s = self.clock.now()
-        self.close()
-
-    def _until_cut(self) -> None:
-        for _ in self.run(300.0):
-            pass
-        self.device.submit = self._cut  # type: ignore[method-assign]
-        for _ in self.run(900.0):
-            pass
-
-    def _cut(self, method: str, path: str, *rest: Any) -> Any:
-        exchange = self._whole(method, path, *rest)
-        if path.startswith(self._request):
-            self.device.submit = self._whole  # type: ignore[method-assign]
-            self.clock.sleep(0.6)  # carried out, and so long later
-            if self._how == "stop":
-                raise KeyboardInterrupt
-            self.kill()
-        return exchange
 
     def resumed(self, minutes: float = 4.0) -> list[Step]:
         """Steps of the next life that bring a sample."""
@@ -99,8 +76,7 @@ def in_a_dose(folder: Path, *names: str) -> Rehearsal:
     """A run after some minutes at full feed, the feed pump of M0 on."""
     run = Full(folder, *names)
     run.begin()
-    for _ in run.run(300.0):
-        pass
+    list(run.run(300.0))
     while not run.device.apps["M0"].data["Pump1"]["ON"]:
         run.loop.step()
     return run
@@ -145,11 +121,10 @@ def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_die
     run.wait(500.0)
     run.begin()
     if decides:
-        run._request, run.device.submit = TARGET, run._cut  # type: ignore[method-assign]
-        with pytest.raises(Killed):
-            for _ in run.run(run.clock.now() + 300.0):
-                pass
-    run.close()
+        run.kill_at(TARGET)
+        run.killed(run.clock.now() + 300.0)
+    else:
+        run.close()
     run.wait(100.0)
     steps, budget = run.resumed(), run.loop.interlock.budget
     assert "overflow" not in reasons(steps)  # what the waste pump took out with each of them is booked too
@@ -196,7 +171,7 @@ def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(
 def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(
     tmp_path: Path, request_: str, fed: bool
 ) -> None:
-    run = Cut(tmp_path, request_, "stop")
+    run = Cut(tmp_path, request_, stops=True)
     end = run.journal("dose_end")[-1]
     true = [d for d in run.device.vials["M0"].doses if d.pump == "Pump1" and d.start_s > run.died_s - 5.0]
     assert len(true) == fed

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
-from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.extensions import ekf  # noqa: F401  (registers its estimator)
 from tests.hardware.emulator_lab import quiet
 
@@ -161,20 +160,8 @@ class Cut(Rehearsal):
         super().__init__(folder, rehearsed(("M0",), HOLD), quiet(mu=0.03), od=0.8)
         self.begin()
         list(self.run(360.0))
-        self.request, whole = request, self.device.submit
-
-        def submit(method: str, path: str, *rest: Any) -> Any:
-            exchange = whole(method, path, *rest)
-            if path.startswith(request):
-                self.device.submit = whole  # type: ignore[method-assign]
-                self.clock.sleep(0.3)
-                self.kill()
-            return exchange
-
-        self.device.submit = submit  # type: ignore[method-assign]
-        with pytest.raises(Killed):
-            list(self.run(900.0))
-        self.close()
+        self.kill_at(request, after_s=0.3)
+        self.killed(900.0)
 
     def told_ml(self) -> float:
         law = self.loop.density.law

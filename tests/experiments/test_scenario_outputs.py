@@ -27,7 +27,7 @@ from hardware.errors import DeviceStateError
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
-from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import BIAS_S, quiet
 
 STEPS = Scenario((0.4, 0.4), (60.0, 20.0), (37.0, 37.0), outputs=("pump3 3 mL/h, pump4 1.5 mL", None))
@@ -143,8 +143,7 @@ def config(schedule: Scenario = STEPS, **flows: float) -> Any:
 def whole(folder: Path, schedule: Scenario = STEPS) -> Rehearsal:
     run = Rehearsal(folder, config(schedule), quiet(mu=0.03), od=0.4)
     run.begin()
-    for _ in run.run():
-        pass
+    list(run.run())
     return run
 
 
@@ -187,8 +186,7 @@ def test_a_dose_by_a_spare_pump_dilutes_as_much_as_one_by_the_feed(tmp_path: Pat
     schedule = Scenario((1.0,), (15.0,), (37.0,), outputs=("pump3 3 mL",))
     run = Rehearsal(tmp_path, config(schedule), quiet(mu=0.0), od=0.4)
     run.begin()
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.truth("M0")["od"] == pytest.approx(0.4 * np.exp(-3.3 / 20.0), rel=0.02)
 
 
@@ -205,25 +203,8 @@ def cut(folder: Path, request: str, stops: bool = False) -> Rehearsal:
     """Nobody but Pump3 gives anything; the program is killed at a request, or stopped as on a signal."""
     run = Rehearsal(folder, config(TWICE), quiet(mu=0.005), od=0.4)
     run.begin()
-    inner = run.device.submit
-
-    def submit(method: str, path: str, *rest: Any) -> Any:
-        exchange = inner(method, path, *rest)
-        if path.startswith(request) and journal(run, "intent"):
-            run.device.submit = inner  # type: ignore[method-assign]
-            run.clock.sleep(0.6)
-            if stops:
-                raise KeyboardInterrupt
-            run.kill()
-        return exchange
-
-    run.device.submit = submit  # type: ignore[method-assign]
-    with pytest.raises((Killed, KeyboardInterrupt)):
-        for _ in run.run():
-            pass
-    if stops:
-        run.reactors.stop()
-    run.close()
+    run.kill_at(request, lambda: bool(journal(run, "intent")), stops=stops)
+    run.killed()
     return run
 
 
@@ -243,8 +224,7 @@ def test_a_kill_in_a_dose_never_gives_it_twice_and_what_flowed_is_booked(
     run.begin()
     assert not any(run.truth("M0")["motors"].values())
     before = len([d for d in run.device.vials["M0"].doses if d.pump == "Pump3"])
-    for _ in run.run():
-        pass
+    list(run.run())
     run.wait(10.0)
     vial = run.device.vials["M0"]
     samples = [tuple(row["sample"]) for row in journal(run, "intent")]
@@ -274,12 +254,10 @@ def test_what_the_interlock_holds_is_held_for_a_spare_pump_too(tmp_path: Path) -
     run = Rehearsal(tmp_path, config(TWICE), quiet(mu=0.005), od=0.4)
     run.begin()
     inject(run.device, "spectrometer_dead", "M0", 1)
-    for _ in run.run(600.0):
-        pass
+    list(run.run(600.0))
     assert run.device.vials["M0"].supplied_ml["Pump3"] == 0.0
     inject(run.device, "spectrometer_dead", "M0", 0)
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.25)
 
 
@@ -316,8 +294,7 @@ def test_the_declared_bias_is_taken_off_a_dose(tmp_path: Path) -> None:
     supply = SupplyConfig(pump3_ml_s=1.0, bias_s=BIAS_S)
     run = Rehearsal(tmp_path, replace(made, backend=replace(made.backend, supply=supply)), quiet(), od=0.4)
     run.begin()
-    for _ in run.run():
-        pass
+    list(run.run())
     assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.01)
 
 
@@ -359,6 +336,5 @@ def test_in_a_simulation_it_dilutes_too_each_reactor_by_its_own_schedule(period_
     vials, both = Plant(plant, 2, np.random.default_rng(0)), SimulatedConfig(reactors=("M0", "M1"))
     reactors, bench = SimulatedReactors(vials, both, period_min), Bench(period_s=60.0 * period_min)
     loop = ClosedLoop(reactors, Still(), Interlock(2, bench=bench), [with_it, replace(with_it, outputs=())])
-    for _ in loop.run():
-        pass
+    list(loop.run())
     np.testing.assert_allclose(reactors.plant.culture.od, [0.4 * np.exp(-2.0 / 20.0), 0.4], rtol=0.005)

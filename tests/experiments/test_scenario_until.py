@@ -13,7 +13,7 @@ from experiments.comparison.config import BenchmarkConfig
 from experiments.loop.progress import Progress
 from experiments.record.summary import summarise
 from hardware import memory
-from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 ALL = np.array([True, True])
@@ -113,8 +113,7 @@ def _run(folder: Path, schedule: Scenario = GROWS, **each: object) -> Rehearsal:
 
 def test_on_the_device_steps_end_where_growth_by_hand_has_them_and_windows_follow(tmp_path: Path) -> None:
     run = _run(tmp_path)
-    for _ in run.run():
-        pass
+    list(run.run())
     first = [window for window in _windows(run) if window["phase"] == 0]
     for window, level in zip(first, (0.5, 0.45), strict=True):
         assert window["ended"] == "condition"
@@ -143,23 +142,11 @@ def _windows(run: Rehearsal) -> list[dict[str, object]]:
 @pytest.mark.slow
 def test_a_run_killed_between_the_decision_that_ends_a_step_and_its_record_goes_on_in_the_next(tmp_path: Path) -> None:
     whole = _run(tmp_path / "whole")
-    for _ in whole.run():
-        pass
+    list(whole.run())
     run = _run(tmp_path / "killed")
-    decided = run.loop._before_dose
-    assert decided is not None
-
-    def dies(step):  # type: ignore[no-untyped-def]
-        decided(step)
-        if step.ended[0]:
-            run.kill()
-
-    run.loop._before_dose = dies
-    with pytest.raises(Killed):
-        for _ in run.run():
-            pass
+    run.kill_decided(lambda step: bool(step.ended[0]))
+    run.killed()
     assert json.loads((run.folder / "state.json").read_text())["steps"][0]["edges"][1] == 600.0  # it does not know
-    run.close()
     run.wait(30.0)
     run.begin()
     assert run.loop.progress.edges[0, 1] == pytest.approx(whole.loop.progress.edges[0, 1], abs=0.05)
@@ -174,22 +161,10 @@ def test_a_run_killed_between_the_decision_that_ends_a_step_and_its_record_goes_
 
 def test_a_run_killed_after_its_first_decision_began_only_once(tmp_path: Path) -> None:
     run = _run(tmp_path)
-    decided = run.loop._before_dose
-    assert decided is not None
-
-    def dies(step):  # type: ignore[no-untyped-def]
-        decided(step)
-        if step.elapsed[1] == 0.0:
-            run.kill()
-
-    run.loop._before_dose = dies
-    with pytest.raises(Killed):
-        for _ in run.run():
-            pass
-    run.close()
+    run.kill_decided(lambda step: bool(step.elapsed[1] == 0.0))
+    run.killed()
     run.begin()
-    for _ in run.run(run.clock.now() + 120.0):
-        pass
+    list(run.run(run.clock.now() + 120.0))
     minute, elapsed = run.record.series("time_min")[1], run.record.series("elapsed_min")[1]
     began = (minute - elapsed)[np.isfinite(elapsed)]
     assert began.size >= 2
