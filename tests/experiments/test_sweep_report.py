@@ -220,12 +220,6 @@ def test_of_a_search_the_values_of_its_jobs_are_those_of_the_command_line(tmp_pa
         assert each | {"n_agents": ""} == {"n_agents": "", "agent.total_steps": "300", "agent.huber": "0.02"}
 
 
-def test_the_interval_is_that_of_a_bootstrap() -> None:
-    """Of 0 and 1 two draws are 0, 1/2 or 1 in one, two and one of four cases: 95 % reach from 0 to 1."""
-    found = sweep_results.statistics(np.array([0.0, 1.0]))
-    assert (found.n, found.interval, found.iqm, found.worst) == (2, (0.0, 1.0), 0.5, 1.0)
-
-
 def test_the_interval_is_one_of_95_per_cent() -> None:
     """Three draws of 0, 1, 1 are all 0 in 1 of 27 cases: 3.7 %, more than 2.5 and less than 5.
 

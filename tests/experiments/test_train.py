@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import torch
 
-from conf import presets
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
 from envs.coculture.optimum import Grid
@@ -167,14 +166,6 @@ def test_a_bad_env_file_is_one_line_that_names_it(content, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
-def test_help_that_nobody_reads_to_the_end_says_nothing_about_it():
-    line = f"{sys.executable} -m experiments.train --help | head -1"
-    done = subprocess.run(["bash", "-o", "pipefail", "-c", line], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -190,25 +181,6 @@ def test_an_agent_that_cannot_learn_the_task_is_refused_before_it_trains(words, 
     with pytest.raises(UserError, match=said):
         train_run.train(entry_point.config(words), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("words", "agent"),
-    [
-        (["env=coculture"], "coculture"),
-        (["+env=coculture_preview", "seed=3"], "coculture_preview"),
-        (["env=relative"], "relative"),
-        (["env=relative", "agent=tuned"], "tuned"),
-        (["agent=paper", "env=coculture"], "paper"),
-        (["+env=sim"], "tuned"),
-        ([], "tuned"),
-    ],
-)
-def test_a_task_comes_with_the_agent_that_belongs_to_it(words, agent):
-    """Unless another is chosen; values on the command line count in either."""
-    own, config = presets.load(f"agent/{agent}"), entry_point.config(words)
-    assert json.loads(json.dumps({key: getattr(config.agent, key) for key in own})) == own
-    assert config.seed == 3 * ("seed=3" in words)
 
 
 @pytest.mark.slow

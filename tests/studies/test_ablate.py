@@ -10,7 +10,7 @@ import pytest
 
 from dqn.config import DQNConfig
 from experiments.cli import frame
-from tests.studies.ablate import AblateConfig, Row, ablate, main, summarise, variant
+from tests.studies.ablate import AblateConfig, Row, ablate, main, summarise
 
 pytestmark = pytest.mark.numeric
 
@@ -69,12 +69,6 @@ def test_every_shipped_variant_differs_from_the_agent_it_starts_from() -> None:
         assert (_plain(config.training(name).agent) != _plain(config.agent)) == bool(values), name
     paper = frame.load(frame.compose("ablate", ["agent=paper"]), AblateConfig(ablations={"paper": {}}))
     assert _plain(config.training("paper").agent) == _plain(paper.agent)
-
-
-def test_lists_become_tuples() -> None:
-    changed = variant(DQNConfig(), "x", {"input_matrix": [[1.0, 0.0]], "input_offset": [0.5]})
-    assert changed.input_matrix == ((1.0, 0.0),)
-    assert hash(changed) is not None
 
 
 def test_summary_by_hand() -> None:
