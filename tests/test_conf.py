@@ -444,7 +444,7 @@ def test_a_job_of_a_cluster_is_told_of_its_end_and_queued_again():
     ("words", "understood"),
     [
         (["env=relative"], ["env=relative", "agent=relative"]), (["env=sim", "seed=1"], ["env=sim", "++seed=1"]),
-        (["+env=coculture_preview", "seed=3"], ["env=coculture_preview", "agent=coculture_preview", "++seed=3"]),
+        (["+env=coculture_preview", "seed=3"], ["env=coculture_preview", "++seed=3", "agent=coculture_preview"]),
         (["env=relative", "agent=paper"], ["env=relative", "agent=paper"]),
         (["agent=paper", "env=relative"], ["agent=paper", "env=relative"]),
         (["env=relative,sim"], ["env=relative,sim"]),

@@ -167,9 +167,7 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
         "station",
     )},
     "hardware/chibio/protocol.py": ERRORS,
-    **{f"hardware/pioreactor/{name}.py": {k: v for k, v in TELLS.items() if k != "say"} for name in (
-        "doses", "jobs", "mailbox", "pumps", "reactors", "station", "web",
-    )},
+    "hardware/pioreactor/*.py": {k: v for k, v in TELLS.items() if k != "say"},
     "hardware/link/*.py": ERRORS,
     "hardware/reactor.py": ERRORS,
     "hardware/storage/journal.py": ERRORS,
@@ -184,7 +182,6 @@ RETURNED = {  # functions whose result is said elsewhere
     "hardware/chibio/ending.py": "_words",
     "hardware/chibio/reactors.py": "_not_off",
     "hardware/chibio/sampling.py": "_measure_lateness",
-    "experiments/record/recovery.py": "complete",
 }
 NAMED = {  # names whose values are said elsewhere
     "experiments/loop/share.py": ("said",),

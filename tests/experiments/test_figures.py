@@ -661,6 +661,7 @@ def test_every_law_keeps_its_mark_and_one_that_does_nothing_is_off_the_scale() -
     assert names == ["OD 0.8", "OD 0.65", "OD 0.5", "37 °C", "30 °C"]
     at = dots(paper.axes[0])
     assert (at[0.117, 2.24], at[0.06, 2.24], at[0.033, 3.0]) == (marks["mpc"], marks["mpc"], marks["pi"])
+    assert dots(paper.axes[1])[12.98, 2.24] == dots(paper.axes[1])[7.0, 2.24] == marks["mpc"]
 
 
 def test_every_curve_of_a_run_is_named_as_its_reactor_in_every_panel() -> None:
