@@ -51,8 +51,7 @@ def _trainer(config: DQNConfig, seeds: range) -> Trainer:
 
 
 def _train(trainer: Trainer) -> Trainer:
-    for _ in trainer.run():
-        pass
+    list(trainer.run())
     return trainer
 
 

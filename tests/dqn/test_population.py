@@ -38,8 +38,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_agents_come_in_the_order_of_their_groups() -> None:
     """Agent 5 of the population is the second of the second group, and is the seed 5 trained alone."""
     population = _population(2)
-    for _ in population.run():
-        pass
+    list(population.run())
     weights = population.weights()
     assert torch.equal(weights[5], population.groups[1].agent.network.flat[1])
     alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
@@ -69,7 +68,6 @@ def test_no_running_mean_stays_too_small_for_the_processor() -> None:
     earlier["adam"]["mean"].fill_(1e-3)
     agent.load_state_dict(earlier)
     population = Population([Trainer(IdentityEnv(range(4)), agent, interval=100)])
-    for _ in population.run():
-        pass
+    list(population.run())
     mean = population.state_dict()["groups"][0]["agent"]["adam"]["mean"][:, 24:28]
     assert not ((mean != 0) & (mean.abs() < torch.finfo(torch.float32).tiny)).any()

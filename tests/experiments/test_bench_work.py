@@ -17,7 +17,7 @@ from experiments import blank as blanks
 from experiments.blank import BlankConfig, blank
 from experiments.calibrate_pump import CalibratePumpConfig, Series, _number, calibrate, report, weigh
 from experiments.cli import frame
-from hardware.chibio.calibrations import load_calibrations, save_calibration
+from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import fit_pump
 from hardware.chibio.protocol import PERIOD_S
@@ -75,9 +75,6 @@ def test_of_two_pumps_the_one_that_is_asked_for_runs_and_is_weighed(tmp_path: Pa
         ran = {pump: weighed[pump] - tared[pump] for pump in tared}
         assert ran.pop("Pump2") == pytest.approx(3 * PERIOD_S * duty, rel=0.1)
         assert not any(ran.values())
-    for duties in ((0.02, 0.06), (0.02, 0.5)):
-        with pytest.raises(ValueError, match=r"duties = .*: allowed at least two different ones from 0.003 to 0.05"):
-            CalibratePumpConfig(backend, duties=duties)
 
 
 @pytest.mark.slow
@@ -142,10 +139,8 @@ def test_each_weighing_stands_beside_what_is_fitted_in_ml_of_one_of_its_doses() 
 
 def test_two_pumps_of_two_units_are_stored_apart_with_what_was_weighed(tmp_path: Path) -> None:
     for reactor, pump, flow in (("M0", "feed", 0.9), ("M3", "waste", 1.4)):
-        rows = [f"{d},{n},{n * flow * (PERIOD_S * d + 0.1):.6f}" for d, n in ((0.01, 20), (0.02, 10), (0.04, 5))]
-        (tmp_path / "w.csv").write_text("doses,grams,duty\n" + "".join(
-            f"{n},{g},{d}\n" for d, n, g in (row.split(",") for row in rows)
-        ))  # fmt: skip
+        weighed = [f"{n},{n * flow * (PERIOD_S * d + 0.1):.6f},{d}" for d, n in ((0.01, 20), (0.02, 10), (0.04, 5))]
+        (tmp_path / "w.csv").write_text("\n".join(["doses,grams,duty", *weighed]) + "\n")
         backend = ChiBioConfig(calibration=str(tmp_path / "c"))
         calibrate(CalibratePumpConfig(backend, reactor, pump, csv=str(tmp_path / "w.csv")), tmp_path)
         told = json.loads((tmp_path / "summary.json").read_text())
@@ -171,8 +166,11 @@ def test_an_answer_that_is_no_mass_is_asked_for_again(capsys: pytest.CaptureFixt
 def test_duties_may_reach_both_ends_of_what_their_pump_takes() -> None:
     assert CalibratePumpConfig(duties=(0.003, 0.05)).duties == (0.003, 0.05)
     assert CalibratePumpConfig(pump="waste", duties=(0.5, 0.003)).duties == (0.5, 0.003)
-    for pump, duties in (("feed", (0.002, 0.05)), ("waste", (0.003, 0.51)), ("feed", (0.02, 0.02))):
-        with pytest.raises(ValueError, match="allowed at least two different ones from 0.003 to 0.0?5$"):
+    for pump, duties in (
+        ("feed", (0.002, 0.05)), ("feed", (0.02, 0.06)), ("feed", (0.02, 0.02)), ("waste", (0.003, 0.51)),
+    ):  # fmt: skip
+        most = {"feed": 0.05, "waste": 0.5}[pump]
+        with pytest.raises(ValueError, match=f"duties = .*: allowed at least two different ones from 0.003 to {most}$"):
             CalibratePumpConfig(pump=pump, duties=duties)
 
 
@@ -236,13 +234,7 @@ def test_without_a_terminal_nobody_is_asked(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.slow
 def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) -> None:
     with EmulatorProcess(["--speed", "100", "--od", "0", "--unblanked", "--reactors", "M0,M1"]) as emulator:
-        backend = ChiBioConfig(
-            url=emulator.url,
-            speed=100.0,
-            reactors=("M0", "M1"),
-            calibration=str(tmp_path / "c"),
-            dosing=ChiBioConfig().dosing,
-        )
+        backend = ChiBioConfig(url=emulator.url, speed=100.0, reactors=("M0", "M1"), calibration=str(tmp_path / "c"))
         blank(BlankConfig(backend, samples=4), tmp_path)
         real, left = truth(emulator)["blank"], truth(emulator)
         connected = CalibratePumpConfig(backend, duties=(0.008, 0.02), doses=3)
@@ -292,23 +284,13 @@ def test_a_culture_is_no_blank(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("what", "content", "words"),
     [
-        ("{", "not readable"),
-        ("- 1", "no keys"),
-        ("flow_ml_s: fast", "flow|could not convert"),
-        ("flow_ml_s: 70", "flow_ml_s = 70"),
+        ("feed", "{", "not readable"), ("feed", "- 1", "no keys"), ("feed", "flow_ml_s: fast", "could not convert"),
+        ("feed", "flow_ml_s: 70", "flow_ml_s = 70"), ("blank", "blank: 13.0", "blank = 13"),
     ],
-)
-def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words: str) -> None:
-    (tmp_path / "M0_feed.yaml").write_text(content)
+)  # fmt: skip
+def test_a_broken_calibration_file_is_named(tmp_path: Path, what: str, content: str, words: str) -> None:
+    (tmp_path / f"M0_{what}.yaml").write_text(content)
     with pytest.raises(UnfitError, match=words):
         load_calibrations(tmp_path, ["M0"])
-
-
-def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
-    save_calibration(tmp_path, "M3", "blank", {"blank": 13000.0})
-    assert load_calibrations(tmp_path, ["M3"])[0].blank == 13000.0
-    save_calibration(tmp_path, "M3", "blank", {"blank": 13.0})
-    with pytest.raises(UnfitError, match="blank = 13"):
-        load_calibrations(tmp_path, ["M3"])

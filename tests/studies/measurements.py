@@ -96,8 +96,7 @@ def _train(config: DQNConfig) -> None:
     from experiments.training.density import Density
 
     def run() -> None:
-        for _ in build.population(Density(EnvConfig()), config, range(1)).run():
-            pass
+        list(build.population(Density(EnvConfig()), config, range(1)).run())
 
     _one_thread(run)
 
