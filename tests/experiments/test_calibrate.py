@@ -280,12 +280,6 @@ def test_yaml_and_dataclass_hold_the_same_defaults() -> None:
     assert frame.load(frame.compose("calibrate", []), CalibrateConfig()) == CalibrateConfig()
 
 
-def test_environment_file_tells_its_origin(real: Calibration) -> None:
-    head = environment_yaml(real, "open_loop.csv").splitlines()[:3]
-    assert all(line.startswith("#") for line in head)
-    assert "open_loop.csv, rows 0:361, 361 readings" in head[1]
-
-
 def test_rows_are_those_of_the_file_also_where_its_beginning_is_left_out() -> None:
     """From minute 40 of a recording by the minute, with two rows rejected among them."""
     r = read_recording(str(SHIPPED))
@@ -373,7 +367,8 @@ def test_the_screen_and_the_file_say_of_each_number_what_it_is(fitted: Calibrati
     ):  # fmt: skip
         assert any(line.strip().startswith(key) and all(n in line for n in numbers) for line in lines), key
     head = environment_yaml(fitted, "mine.csv")
-    for part in ("mu 0.018 to 0.023 1/min, tau 0.35 to 0.44", "1.25 %", "it drifts", "it is noisy"):
+    origin = "mine.csv, rows 0:361, 361 readings"
+    for part in (origin, "mu 0.018 to 0.023 1/min, tau 0.35 to 0.44", "1.25 %", "it drifts", "it is noisy"):
         assert any(line.startswith("#") and part in line for line in head.splitlines())
     model = OmegaConf.create(head)
     assert (model.mu, model.tau, model.control_min) == (0.02, 0.4, 1.0)
