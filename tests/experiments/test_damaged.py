@@ -151,7 +151,7 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
         (b"\xff\xfe\0\1", "no UTF-8 text"),
         (b"backend: x\n", "backend = x: allowed keys and values"),
         (b"backend:\n  kind: [1]\ncontroller:\n  kind: pi\n", "backend.kind = [1]: allowed sim, chibio, emulator"),
-        (b"backend:\n  kind: sim\ncontroller:\n  kind: x\n", "controller.kind = x: allowed dqn"),
+        (b"backend:\n  kind: sim\ncontroller:\n  kind: x\n", "controller.kind = x: allowed dqn, pi, pi_tuned, mpc"),
         (b"backend:\n  kind: sim\ncontroller:\n  kind: pi\nfsync: ${nowhere}\n", "an alias or interpolation in line 5"),
         (
             b"backend:\n  kind: chibio\n  speed: fast\ncontroller:\n  kind: pi\n",
