@@ -29,7 +29,7 @@ from tests.programs import OURS, Program, run
 TRAIN = "experiments.train"
 PARALLEL = "joblib", "submitit_local"
 BLANK = {"WITHOUT_FIGURES": "1"}
-SMOKE = ["+experiment=smoke", "agent.total_steps=300"]
+SMOKE = ["+experiment=smoke", "agent.total_steps=300", "env.episode_steps=40", "env.setpoints=[0.3,0.7]"]
 LONG = ["n_agents=1", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200", "checkpoint_every=100"]
 pytestmark = pytest.mark.xdist_group("sweep")  # its tests share what a single run gives
 
