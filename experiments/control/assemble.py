@@ -194,7 +194,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         log.warning("plant: backend=%s has vials of its own, plant.* changes nothing there", config.backend.kind)
     _check_fit(config, family, scenarios, ends)
     further = _further(config, plant, folder, scenarios)
-    if any(not isinstance(signal, Light) for signal in further):  # the device has to measure what an estimate may need
+    if any(signal.sees_light for signal in further):  # the device has to measure it
         backend = family.seeing_fluorescence(backend)
     fastest = min(model.max_pump_rate, bench.max_rate)
     model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from envs.scenario import Scenario
 from experiments.laws.base import Array, Controller, Mask
 from experiments.loop.progress import Progress
-from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, fitting
+from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, fitting, shaped
 from experiments.loop.supply import Supply
 from hardware import memory
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
@@ -157,7 +157,8 @@ class ClosedLoop:
         decided = self.density.decide(sample)
         commands: dict[str, Array] = {}
         for signal, actuator in self._commanded:
-            command = self.interlock.command(actuator, signal.decide(sample))
+            asked = shaped(signal.decide(sample), len(self.done), f"signal {signal.name}: what decide returns")
+            command = self.interlock.command(actuator, asked)
             if actuator == THERMOSTAT:
                 command = temperature = np.where(np.isfinite(command), command, temperature)
             elif actuator.pump:
@@ -176,6 +177,8 @@ class ClosedLoop:
         reasons: Sequence[str | None] = verdict.reasons
         for signal in self.signals:
             found = signal.find(sample, commands.get(signal.actuator, verdict.rate))
+            for name, values in (*found.columns.items(), *found.why.items()):
+                shaped(values, len(self.done), f"signal {signal.name}: {name}")
             columns, explanation = columns | dict(found.columns), explanation | dict(found.why)
             if found.warnings:
                 reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]

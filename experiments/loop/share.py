@@ -61,6 +61,7 @@ class Light:
     """The fluorescence of reactors whose share nobody holds: recorded, and nothing done about it."""
 
     name, actuator, columns, memory = "fluorescence", "", COLUMNS[:1], None
+    sees_light = False  # what is measured anyhow
 
     def decide(self, sample: Sample) -> Array:
         """See `Signal.decide`: it asks for no temperature."""
@@ -96,7 +97,7 @@ class Share:
       simulated: the recording has the true share, which `truth` gives.
     """
 
-    name, actuator = "composition", THERMOSTAT.name
+    name, actuator, sees_light = "composition", THERMOSTAT.name, True
     remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(

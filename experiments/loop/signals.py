@@ -33,12 +33,14 @@ __all__ = [
     "add",
     "fitting",
     "made",
+    "shaped",
     "within_2sd",
 ]
 
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
 FILTER_ALARM = "filter_alarm"  # in a row; on the screen the supervisor's beginning and end are said
+PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
 
 
@@ -94,7 +96,7 @@ class Signal(Protocol):
 
     name: under which its state is saved. actuator: name of what acts on it, "" for nothing. columns: that it adds to a
     recording, behind those of signals before it. Of a column NAME and one NAME_setpoint the summary gives the errors of
-    every window.
+    every window. sees_light: whether it needs the fluorescence, which the device then measures.
     """
 
     @property
@@ -105,6 +107,9 @@ class Signal(Protocol):
 
     @property
     def columns(self) -> tuple[str, ...]: ...
+
+    @property
+    def sees_light(self) -> bool: ...
 
     def decide(self, sample: Sample) -> Array:
         """Watch a sample and decide on a command, (N,), in the unit of the actuator: mL/s, degC.
@@ -159,6 +164,7 @@ class Density:
 
     name, actuator = "controller", FEED.name
     columns: tuple[str, ...] = ()  # the recording has them in any case
+    sees_light = False
 
     def __init__(self, law: Controller, scale: Array | float = 1.0, max_rate: float = math.inf) -> None:
         self.law, self._scale, self._max_rate = law, scale, max_rate
@@ -239,13 +245,23 @@ def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
     return MAKERS[name](config, schedules)
 
 
+def shaped(values: Array, n: int, what: str) -> Array:
+    """Check that there is one value for each reactor; return them. Raises: ValueError naming what they are."""
+    found = np.asarray(values)
+    if found.shape != (n,):
+        raise ValueError(f"{what} has the shape {found.shape}: allowed ({n},), one value for each reactor")
+    return found
+
+
 def fitting(signals: Sequence[Signal], actuators: Sequence[Actuator]) -> list[Signal]:
     """Check that each signal acts by something that the reactors have, and no two by the same; return them.
 
-    Raises: ValueError naming the signals, and what there is.
+    Raises: ValueError naming the signals, and what there is, or what a signal lacks.
     """
     known = [actuator.name for actuator in actuators]
     for k, signal in enumerate(signals):
+        if missing := [part for part in PARTS if not hasattr(signal, part)]:
+            raise ValueError(f"signal {signal.name} has no {', '.join(missing)} (docs/extending.md, A signal)")
         if signal.actuator and signal.actuator not in known:
             raise ValueError(f"{signal.name} acts by the {signal.actuator}: these reactors have {', '.join(known)}")
         for other in signals[:k]:

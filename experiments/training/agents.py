@@ -14,6 +14,9 @@ from experiments.training.tasks import Task
 
 __all__ = ["Streams", "add", "build", "names"]
 
+PARTS = (
+    "config", "network", "n_agents", "steps", "updates", "act", "observe", "curves", "state_dict", "load_state_dict",
+)  # fmt: skip
 Streams = Mapping[str, Sequence[np.random.SeedSequence]]
 """By name, one per agent."""
 
@@ -58,6 +61,8 @@ def add(
       what: the sentence that the help shows.
     Raises: ValueError for a kind that exists.
     """
+    if kind in AGENTS:
+        raise ValueError(f"agent {kind}: there is one of this name already; choose another")
     presets.add(f"agent/{kind}", {"kind": kind}, what)
     AGENTS[kind], KINDS[config] = config, Kind(make, tuple(streams))
 
@@ -68,5 +73,11 @@ def names(config: Any) -> tuple[str, ...]:
 
 
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
-    """Make one agent per seed of each stream. Raises: ValueError for a config that the task cannot be learned with."""
-    return KINDS[type(config)].make(config, task, streams, device)
+    """Make one agent per seed of each stream.
+
+    Raises: ValueError for a config that the task cannot be learned with, or an agent that lacks a part of `Agent`.
+    """
+    made = KINDS[type(config)].make(config, task, streams, device)
+    if missing := [part for part in PARTS if not hasattr(made, part)]:
+        raise ValueError(f"agent {config.kind} has no {', '.join(missing)} (docs/extending.md, An agent)")
+    return made

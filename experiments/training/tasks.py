@@ -88,6 +88,8 @@ def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) ->
       task: called with the config. what: the sentence that the help shows.
     Raises: ValueError for a kind that exists.
     """
+    if kind in ENVS:
+        raise ValueError(f"env {kind}: there is one of this name already; choose another")
     presets.add(f"env/{kind}", {"kind": kind}, what)
     ENVS[kind], TASKS[config] = config, task
 

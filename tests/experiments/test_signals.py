@@ -20,6 +20,7 @@ from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
+from experiments.training import agents, tasks
 from hardware.actuator import THERMOSTAT
 from hardware.emulator.device import plant_preset
 from hardware.safety.interlock import Interlock, kinds_of
@@ -120,5 +121,9 @@ def test_names_and_actuators_are_used_once() -> None:
     held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
     with pytest.raises(ValueError, match="light and light act by the same thermostat"):
         signals.fitting(held, [THERMOSTAT])
+    with pytest.raises(ValueError, match="agent dqn: there is one of this name already"):
+        agents.add("dqn", type("Other", (), {}), Any, (), "Nothing.")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="env density: there is one of this name already"):
+        tasks.add("density", type("Other", (), {}), Any, "Nothing.")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"signals\.dark: .*allowed .*light"):
         signals.made("dark", None, [SCHEDULE])

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_resumed_run_gives_the_drug_that_one_without_a_pause_gives() -> None:
 class Lamp:
     """Asks for 140 % and for 30 %; an integral that nobody gets."""
 
-    name, actuator, columns, memory = "lamp", "lamp", ("lamp",), None
+    name, actuator, columns, memory, sees_light = "lamp", "lamp", ("lamp",), None, False
 
     def decide(self, sample: Any) -> Any:
         return np.array([140.0, 30.0])
@@ -137,6 +138,39 @@ def test_an_actuator_of_a_family_s_own_gets_its_command_cut_to_its_limits() -> N
     assert [kinds_of(reason or "") for reason in step.reasons] == [["command_limit"], []]
     with pytest.raises(ValueError, match=r"lamp acts by the lamp: these reactors have feed pump, thermostat, pump 3"):
         loop(lit, Lamp())
+
+
+class Lone(Lamp):
+    """Answers for one reactor, whatever there are."""
+
+    def __init__(self, part: str) -> None:
+        self.part = part
+
+    def decide(self, sample: Any) -> Any:
+        return np.zeros(1) if self.part == "decide" else super().decide(sample)
+
+    def find(self, sample: Any, given: Any) -> Findings:
+        return Findings(**{self.part: {"lamp": [1.0, 2.0, 3.0]}}) if self.part != "decide" else Findings()
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ("decide", r"lamp: what decide returns has the shape \(1,\): allowed \(2,\)"),
+        ("columns", r"lamp: lamp has the shape \(3,\): allowed \(2,\)"),
+        ("why", r"lamp: lamp has the shape \(3,\): allowed \(2,\)"),
+    ],
+)
+def test_a_signal_that_answers_for_other_reactors_is_refused(part: str, said: str) -> None:
+    plant = Plant(PlantConfig(), 2, np.random.default_rng(0))
+    lit = Lit(plant, SimulatedConfig(reactors=("M0", "M1")))
+    with pytest.raises(ValueError, match=said):
+        loop(lit, Lone(part), actuators=(FEED, Actuator("lamp", "%", 0.0, 85.0))).step()
+
+
+def test_a_signal_without_a_part_is_refused() -> None:
+    with pytest.raises(ValueError, match="signal lamp has no sees_light, decide, find, dosed, memory"):
+        loop(vials(), SimpleNamespace(name="lamp", actuator="", columns=()))
 
 
 @pytest.mark.parametrize(

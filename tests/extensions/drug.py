@@ -52,7 +52,7 @@ class Stress:
 class Drug:
     """Growth as averaged, and the share of the drug's own medium in the vial. See `Signal`."""
 
-    name, columns = "drug", ("drug", "growth", "growth_setpoint")
+    name, sees_light, columns = "drug", False, ("drug", "growth", "growth_setpoint")
     remembers = ("law", "growth", "share", "log_od", "minute", "given_ml")
 
     def __init__(self, config: StressConfig, schedules: Sequence[Scenario]) -> None:

@@ -53,7 +53,7 @@ class Light:
     """The light, averaged over some readings. See `Signal`."""
 
     name, actuator, columns = "light", THERMOSTAT.name, ("light", "light_setpoint")
-    remembers = ("law", "mean")
+    remembers, sees_light = ("law", "mean"), True
 
     def __init__(self, config: IntegralConfig, schedules: Sequence[Scenario]) -> None:
         self.config, self.law = config, registry.build(config, "light")
