@@ -177,7 +177,7 @@ class ClosedLoop:
         reasons: Sequence[str | None] = verdict.reasons
         for signal in self.signals:
             found = signal.find(sample, commands.get(signal.actuator, verdict.rate))
-            for name, values in (*found.columns.items(), *found.why.items()):
+            for name, values in found.columns.items():
                 shaped(values, len(self.done), f"signal {signal.name}: {name}")
             columns, explanation = columns | dict(found.columns), explanation | dict(found.why)
             if found.warnings:

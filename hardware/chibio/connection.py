@@ -109,6 +109,13 @@ class Connection:
         self._unsure = before  # only the server answers 200, even if the body is garbled
         state = parse_state(reply.body)
         self._unsure = False
+        last = self.state
+        if (
+            last is not None
+            and (last.selected, last.start_time) == (state.selected, state.start_time)
+            and (state.sample_s < last.sample_s or state.cycles < last.cycles)
+        ):
+            raise LinkError("an answer of an earlier time came again; look for a proxy or tunnel that keeps answers")
         if self.name not in state.present:
             self.state = None  # nothing is sent to it from now on
             raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")

@@ -104,8 +104,8 @@ def found(
             added[f"{pump.part}_anew"] = pump.off[0], pump.dose_s
         if is_on or off_heard:
             continue
-        if restarted:  # as a rule that is why it was not heard any more
-            off = min(seen_s, now_s), min(now_s, max(seen_s, asked_s + PERIOD_S - 1.0))
+        if restarted:  # at some time since it was last heard, and until then it may have repeated the dose
+            off = min(seen_s, now_s), now_s
         elif not math.isnan(agent_s):
             off = agent_s, agent_s
         elif not math.isnan(pump.tried_s) and not silent:
@@ -118,7 +118,7 @@ def found(
             off = asked_s, asked_s
         else:
             heard_s = pump.on[1] if on_heard else asked_s
-            off = heard_s, max(heard_s, min(now_s, seen_s + silence_s + SWITCH_S))
+            off = heard_s, max(heard_s, min(now_s, seen_s + silence_s + SWITCH_S) if stopped is None else now_s)
         added[f"{pump.part}_off"] = off
     return added
 

@@ -136,18 +136,25 @@ def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_die
 
 
 @pytest.mark.parametrize("how", ["worker_wipe", "power_cut"])
-def test_a_device_that_was_restarted_repeated_nothing(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("after_s", [3.0, 271.0])
+def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_knows_when(
+    tmp_path: Path, how: str, after_s: float
+) -> None:
     run = Cut(tmp_path, FEED_ON)
-    run.wait(3.0)
+    run.wait(after_s)
     inject(run.device, how)
     run.wait(40.0)
     if how == "power_cut":
         inject(run.device, "restart")
-    run.wait(860.0)
+    run.wait(860.0 - after_s)
+    true = [d.seconds for d in run.device.vials["M0"].doses if d.pump == "Pump1" and d.start_s > run.died_s - 5.0]
+    ended = len(run.journal("dose_end"))
     run.resumed()
     assert "the device was restarted in a dose" in run.note()
-    assert abs(run.off_by_ml()) < 1.0
-    assert not any(row["feed_times"] for row in run.journal("dose_end"))
+    end = run.journal("dose_end")[ended]
+    assert len(true) == 1 + after_s // 63.0
+    assert end["feed_low_ml"] - 0.1 <= sum(true) <= end["feed_ml"] * (1.0 + end["feed_times"]) + 0.1
+    assert run.off_by_ml() > -0.1 * len(true)
 
 
 @pytest.mark.parametrize(

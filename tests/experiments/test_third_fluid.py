@@ -158,7 +158,6 @@ class Lone(Lamp):
     [
         ("decide", r"lamp: what decide returns has the shape \(1,\): allowed \(2,\)"),
         ("columns", r"lamp: lamp has the shape \(3,\): allowed \(2,\)"),
-        ("why", r"lamp: lamp has the shape \(3,\): allowed \(2,\)"),
     ],
 )
 def test_a_signal_that_answers_for_other_reactors_is_refused(part: str, said: str) -> None:

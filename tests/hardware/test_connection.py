@@ -52,10 +52,19 @@ def after_a_refusal(refusal: Reply | Exception) -> tuple[Steps, list[Act]]:
     ]
 
 
+def at(sample_s: float, cycles: int, started: str = "2026-01-01 00:00:00") -> Steps:
+    """A read of an experiment that has come so far."""
+    return read(state(time__record=[sample_s], Experiment__cycles=cycles, Experiment__startTime=started))
+
+
 CASES: dict[str, tuple[Steps, list[Act]]] = {
     "another unit at this position, and whatever stands there now is not ours": (
         read(state()) + read(state(DeviceID="other")),
         [READ, (IdentityError, "pinned", "read"), (*UNSEEN, OFF[0])],
+    ),
+    "an answer of an earlier time comes again, by its record or its count of cycles": (
+        [*at(120.3, 3), *at(60.2, 3), *at(120.3, 2), *at(120.3, 3), *at(0.07, 1, "2026-01-02 00:00:00")],
+        [READ, *(2 * [(LinkError, "earlier time", "read")]), READ, READ],
     ),
     "another client's selection: the pair is repeated": (2 * read(state("M1")) + read(state()), [READ]),
     "a client that keeps selecting": (3 * read(state("M1")), [(DeviceStateError, "another client", "read")]),

@@ -136,9 +136,11 @@ def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
         (ENDED, read(False, True, pump_targets=(5.04 / 63.0, 9.0 / 63.0, 0.0, 0.0)), 104.0, 101.0, {}, 5.2, 0.0),
         (ENDED, read(False, True, pump_targets=(math.nan, 9.0 / 63.0, 0.0, 0.0)), 110.0, 101.0, {}, 1.2, 0.0),
         (UNFED, read(False, True, pump_targets=(0.0, 9.0 / 63.0, 0.0, 0.0)), 1000.0, 98.0, {}, 0.0, 0.0),
-        # a device that was restarted forgot its pumps; as a rule that is why it was silent
-        (OPEN, read(True, True, "another"), 1000.0, 101.5, {}, 1.2, 0.7),
-        (OPEN, read(False, False, " Waiting "), 1000.0, 101.5, {}, 1.2, 0.7),
+        (OPEN, read(False, False), 500.0, 101.0, {}, 8.4, 0.0),  # where there is no agent, however long it went on
+        # a device that was restarted forgot its pumps, nobody knows when; until then it repeated the dose
+        (OPEN, read(True, True, "another"), 1000.0, 101.5, {}, 18.0, 0.7),
+        (OPEN, read(False, False, " Waiting "), 155.0, 101.5, {}, 1.2, 0.7),
+        (OPEN, read(False, False, " Waiting "), 1000.0, 101.5, None, 18.0, 0.7),
         (replace(OPEN, experiment=""), read(True, True, "another"), 1000.0, 101.0, {}, 18.0, 18.0),
     ],
 )  # fmt: skip
