@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,21 +31,20 @@ from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
 from experiments.control.policies import load_policy
 from experiments.laws import registry
-from experiments.laws.base import Accounts, Controller, Watches
-from experiments.laws.share.base import Acts
+from experiments.laws.base import Controller
 from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.program import Program
-from experiments.loop.loop import ClosedLoop
+from experiments.laws.share.recall import Recall
+from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import WindowMetrics, window_metrics
-from experiments.loop.share import program_of
-from experiments.loop.signals import within_2sd
-from hardware.safety.config import Response
+from experiments.loop.share import TRUE, Share, program_of
+from experiments.loop.signals import Signal, within_2sd
+from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
 __all__ = [
     "RUNS", "Cell", "DensityTrial", "Followed", "Loops", "ShareTrial", "Trial", "Window", "calibrate",
-    "cells", "run_cell", "run_share", "run_trial", "windows",
+    "cells", "run_cell", "run_trial", "windows",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
@@ -55,6 +54,8 @@ Array = NDArray[np.float64]
 FACTOR_SD, OFFSET_SD = 0.02, 5.0
 """Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
 SUPERVISED = ("supervised", "alarm")
+SHOWN = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
+"""Fields of a `ShareTrial` and the columns of a recording that they are."""
 LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
 
 
@@ -164,6 +165,47 @@ class ShareTrial(Trial):
     od: Array
 
 
+def _closed(
+    plant_config: PlantConfig,
+    schedule: Scenario,
+    model: EnvConfig,
+    replicates: int,
+    seed: int,
+    make: Callable[[Plant, Bench], tuple[Controller, Sequence[Signal], SafetyConfig]],
+) -> tuple[ClosedLoop, Plant]:
+    """Close a loop around N replicates, which are named M0, M1, ..., as one batch.
+
+    The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
+
+    Args: model: control period and largest pump rate, the interlock's limit. make: from the vials and their bench what
+      controls the density, the signals beside it, and the limits of the interlock.
+    """
+    if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
+        plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
+    bench = Bench(period_s=60.0 * model.control_min, max_rate=model.max_pump_rate)
+    plant = Plant(plant_config, replicates, np.random.default_rng(seed), bench.volume_ml)
+    reactors = SimulatedReactors(
+        plant, SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates))), bench.control_min
+    )
+    controller, further, safety = make(plant, bench)
+    loop = ClosedLoop(reactors, controller, Interlock(replicates, safety, bench), schedule, further=further)
+    loop.density.known(plant, reactors.config.pump_ml_s, bench)
+    return loop, plant
+
+
+def _record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
+    """Run a loop to its end; return the minutes of its schedule, (K,), and what is seen at each, (N, K) by name."""
+    schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
+    minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
+    stored: dict[str, Array] = {}
+    for step in loop.run():
+        row = np.flatnonzero(step.rows & (step.phase >= 0))
+        column = np.rint(step.elapsed[row] / every_min).astype(np.intp)
+        for key, values in seen(step).items():
+            stored.setdefault(key, np.full((step.rows.size, minute.size), np.nan))[row, column] = values[row]
+    return minute, stored
+
+
 def run_trial(
     cell: Cell,
     plant_config: PlantConfig,
@@ -173,50 +215,34 @@ def run_trial(
     replicates: int,
     seed: int,
 ) -> DensityTrial:
-    """Run N replicates, which are named M0, M1, ..., as one batch.
+    """Run N replicates of a loop that holds the density.
 
-    The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
-
-    Args:
-      cell: what it is called. make: builds the controller for a plant.
-      model: control period and largest pump rate; the interlock's limit.
+    Args: cell: what it is called. make: builds the controller for a plant. The others: of `_closed`.
     """
-    if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
-        plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
-    bench = Bench(period_s=60.0 * model.control_min, max_rate=model.max_pump_rate)
-    plant = Plant(plant_config, replicates, np.random.default_rng(seed), bench.volume_ml)
-    reactors = SimulatedReactors(
-        plant, SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates))), bench.control_min
+    loop, plant = _closed(
+        plant_config, schedule, model, replicates, seed, lambda vials, _: (make(vials), (), SafetyConfig())
     )
-    loop = ClosedLoop(reactors, make(plant), Interlock(replicates, bench=bench), schedule)
-    loop.density.known(plant, reactors.config.pump_ml_s, bench)
-    minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
-    fields = ("od", "clean", "rate", "temperature", "media_ml")
-    stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
-    held = np.zeros(replicates)
-    told: dict[str, Array] = {}  # sum and number of what is told in the schedule, (2, N) each
-    for step in loop.run():
-        row = np.flatnonzero(step.rows & (step.phase >= 0))
-        column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
-        seen = {
+
+    def seen(step: Step) -> dict[str, Array]:
+        why = step.explanation
+        of_law = {key: why[key] for key in SUPERVISED if key in why} | within_2sd(why)
+        return of_law | {
             "od": step.od,
             "clean": plant.apparent_od,
             "rate": step.rate,
             "temperature": step.temperature,
             "media_ml": plant.feed.delivered_ml,
+            "held": (step.response >= Response.HOLD).astype(np.float64),
         }
-        for key, values in seen.items():
-            stored[key][row, column] = values[row]
-        held[row] += step.response[row] >= Response.HOLD
-        why = step.explanation
-        beside = {key: why[key] for key in SUPERVISED if key in why} | within_2sd(why)
-        for key, value in beside.items():
-            known = step.rows & (step.phase >= 0) & np.isfinite(value)
-            told.setdefault(key, np.zeros((2, replicates)))[:, known] += np.stack([value, np.ones(replicates)])[
-                :, known
-            ]
-    parts = {key: np.divide(s, n, out=np.full(replicates, np.nan), where=n > 0) for key, (s, n) in told.items()}
-    return DensityTrial(cell, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed, told=parts)
+
+    minute, stored = _record(loop, seen)
+    fields = {key: stored.pop(key) for key in ("od", "clean", "rate", "temperature", "media_ml")}
+    held = np.nansum(stored.pop("held"), axis=1)
+    told = {}
+    for key, values in stored.items():
+        known = np.isfinite(values).sum(axis=1)
+        told[key] = np.divide(np.nansum(values, axis=1), known, out=np.full(replicates, np.nan), where=known > 0)
+    return DensityTrial(cell, schedule, minute, **fields, held=held, overflowed=plant.vessel.overflowed, told=told)
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:
@@ -249,76 +275,31 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
 
 def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
     """Run a trial in which a law holds the share, and a controller the density beside it."""
-    pair, kind = read_pair(config.pair), config.compositions[cell.controller].kind
-    scenario = config.scenarios[cell.scenario]
-    program = program_of(scenario)
-    plant = Plant(config.plants[cell.plant], config.replicates, np.random.default_rng(config.seed))
     composition, policy = config.compositions[cell.controller], followed[0] if followed else None
-    law = registry.build(composition, registry.SHARE, policy=policy, program=program, pair=pair)
-    estimator = CompositionEstimator(composition.estimator, pair=pair)
-    estimator.reset(plant.n)
-    law.reset(plant.n)
-    if cell.calibrated:
-        calibrate(estimator, plant, config.seed)
-    found = run_share(
-        plant,
-        estimator,
-        law,
-        _beside(config, cell.density),
-        program,
-        np.asarray(scenario.setpoints),
-        np.asarray(scenario.temperatures),
-        scenario.announce_min if cell.announced else 0.0,
-    )
-    foresight = cell.announced and kind in registry.FORESIGHT
-    minute = np.arange(found["share"].shape[1], dtype=np.float64)
+    scenario, pair = config.scenarios[cell.scenario], read_pair(config.pair)
+    schedule = scenario if cell.announced else replace(scenario, announce_min=0.0)
+    program, (coldest, warmest) = program_of(scenario), pair.temperatures
+
+    def make(plant: Plant, bench: Bench) -> tuple[Controller, Sequence[Signal], SafetyConfig]:
+        law = registry.build(composition, registry.SHARE, policy=policy, program=program, pair=pair)
+        estimator = CompositionEstimator(composition.estimator, np.full(plant.n, bench.volume_ml), pair)
+        share = Share(Recall(estimator), law, [schedule] * plant.n, simulated=True)
+        share.truth = lambda: plant.culture.share
+        if cell.calibrated:
+            calibrate(estimator, plant, config.seed)
+        safety = SafetyConfig(composition_low=coldest, composition_high=warmest)
+        return _beside(config, cell.density), (share,), safety
+
+    plant_config = config.plants[cell.plant]
+    loop, plant = _closed(plant_config, schedule, config.env, config.replicates, config.seed, make)
+
+    def seen(step: Step) -> dict[str, Array]:
+        columns = {key: step.columns[column] for key, column in SHOWN.items()}
+        return columns | {"temperature": step.temperature, "od": plant.culture.od}
+
+    minute, found = _record(loop, seen)
+    foresight = cell.announced and composition.kind in registry.FORESIGHT
     return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
-
-
-def run_share(
-    plant: Plant,
-    estimator: CompositionEstimator,
-    law: Acts,
-    density: Controller,
-    program: Program,
-    setpoints: Array,
-    temperatures: Array,
-    announce_min: float,
-) -> dict[str, Array]:
-    """Read, decide and dose once a minute to the end of the program: the fields of a `ShareTrial` that are (N, K).
-
-    There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors
-    and noise.
-
-    Args: estimator, law: reset for the plant's vials. setpoints, temperatures: OD and degC of each phase, (phases,);
-      the latter where no share is asked for.
-    """
-    n, last, low_high = plant.n, round(program.total_min), estimator.pair.temperatures
-    density.reset(n)
-    rows = np.ones(n, dtype=np.bool_)
-    fields = ("share", "estimate", "low", "high", "temperature", "od")
-    stored: dict[str, Any] = {key: np.empty((n, last + 1), dtype=np.float32) for key in fields}
-    for k in range(last + 1):
-        minute = np.full(n, float(k))
-        phase = min(int(np.searchsorted(program.edges[1:], k + 1e-9, side="right")), len(setpoints) - 1)
-        od, warm = plant.read_od(), plant.thermal.read()
-        estimator.watch(od, plant.read_fluorescence(), warm, minute, rows)
-        wanted = program.wanted(minute, announce_min)
-        asked = np.isfinite(wanted.setpoint)
-        chosen = law.act(estimator.estimate(), wanted, minute, asked & estimator.begun)
-        target = np.where(asked, chosen, temperatures[phase])
-        if isinstance(density, Watches):
-            density.watch(od, warm, minute, rows)
-        rate = density.act(od, np.full(n, setpoints[phase]), minute, rows)
-        found = estimator.explain()
-        now = (plant.culture.share, found["ratio"], found["ratio_low"], found["ratio_high"], warm, plant.culture.od)
-        for key, values in zip(fields, now, strict=True):
-            stored[key][:, k] = values
-        plant.advance(1.0, 60.0 * rate, temperature_target=np.where(asked, np.clip(target, *low_high), target))
-        estimator.dosed(60.0 * rate)
-        if isinstance(density, Accounts):
-            density.dosed(60.0 * rate)
-    return stored
 
 
 def _beside(config: BenchmarkConfig, name: str) -> Controller:

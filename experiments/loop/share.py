@@ -112,7 +112,6 @@ class Share:
         self.schedules, self.warnings, self.simulated = schedules, warnings or ShareWarnings(), simulated
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)
         n = len(schedules)
-        self._programs = [program_of(s) for s in schedules]
         self._goal, self._best = np.full((2, n), np.nan), np.full((2, n), np.nan)  # the nearest share to it so far
         self._nearer_min, self._narrow_min = np.full((2, n), np.nan), np.full(n, np.nan)
         estimator.reset(n)
@@ -148,12 +147,12 @@ class Share:
 
     def wanted(self, elapsed: Array) -> Wanted:
         """Return what each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
-        each = [
-            program.wanted(elapsed[i : i + 1], schedule.announce_min)
-            for i, (program, schedule) in enumerate(zip(self._programs, self.schedules, strict=True))
-        ]
-        keys = ("setpoint", "following", "minutes")
-        return Wanted(*(np.concatenate([getattr(wanted, key) for wanted in each]) for key in keys))
+        found = np.empty((3, elapsed.size))
+        for schedule in set(self.schedules):
+            rows = np.array([other == schedule for other in self.schedules])
+            wanted = program_of(schedule).wanted(elapsed[rows], schedule.announce_min)
+            found[:, rows] = wanted.setpoint, wanted.following, wanted.minutes
+        return Wanted(*found)
 
     def _warned(
         self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask

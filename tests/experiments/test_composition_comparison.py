@@ -13,12 +13,13 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import benchmark
 from experiments.cli import frame
-from experiments.comparison import statistics, studies, trials
+from experiments.comparison import statistics, studies
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.run import policies_of, with_pair
 from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
 from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from experiments.loop.loop import ClosedLoop
 from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.numeric
@@ -236,20 +237,13 @@ def test_a_row_of_a_share_tells_root_mean_square_cover_and_densities_of_all_its_
     assert row["ratio_abs_error_last2h"] == pytest.approx(0.05)  # the one window in which the setpoint rests
 
 
-class Asked(Exception):
-    """What a loop of a share was begun with."""
-
-
 def begun(monkeypatch, cell, **changes):
-    """Plant, estimator, law, density, program, setpoints, temperatures and foresight of a cell, before its first."""
-
-    def run_share(*given):
-        raise Asked(given)
-
-    monkeypatch.setattr(trials, "run_share", run_share)
-    with pytest.raises(Asked) as caught:
+    """Vials and estimator of a cell, before its first sample."""
+    loops = []
+    monkeypatch.setattr(ClosedLoop, "run", lambda loop: iter(loops.append(loop) or ()))
+    with pytest.raises(TypeError):  # nothing was seen
         run_cell(replace(config(), **changes), cell, None)
-    return caught.value.args[0]
+    return loops[0].reactors.plant, loops[0].signals[1].estimator.estimator
 
 
 def test_the_seed_of_the_config_is_that_of_vials_and_of_what_is_known_of_their_sensors(monkeypatch):
@@ -267,45 +261,13 @@ def test_the_seed_of_the_config_is_that_of_vials_and_of_what_is_known_of_their_s
     np.testing.assert_array_equal(one[1].mean, same[1].mean)
 
 
-def test_each_phase_of_a_share_has_its_own_density_and_temperature_and_each_vial_its_own_dose(monkeypatch):
-    """Three minutes without a share at OD 0.3 and 31 degC, then four in which the law asks for more than is allowed."""
-
-    class Density:
-        seen, told = [], []
-
-        def reset(self, n):
-            self.told.clear(), self.seen.clear()
-
-        def act(self, od, setpoint, minute, rows):
-            self.seen.append((minute.tolist(), setpoint.tolist()))
-            return np.array([0.001, 0.002])
-
-        def dosed(self, volume_ml):
-            self.told.append(volume_ml.tolist())
-
-    class Law:
-        def act(self, estimate, wanted, minute, rows):
-            return np.full(2, 40.0)
-
-    schedule = Scenario((0.3, 0.6), (3.0, 4.0), (31.0, 35.0), ratios=(None, 0.4))
-    plant, density = Plant(config().plants["coculture"], 2, np.random.default_rng(1)), Density()
-    estimator = CompositionEstimator(CompositionEstimatorConfig())
-    estimator.reset(2)
-    given, advance = [], plant.advance
-    monkeypatch.setattr(plant, "advance", lambda *a, **k: (given.append((*a, *k.values())), advance(*a, **k)))
-    phases = np.asarray(schedule.setpoints), np.asarray(schedule.temperatures)
-    found = trials.run_share(plant, estimator, Law(), density, trials.program_of(schedule), *phases, 0.0)
-    assert density.seen == [([float(k)] * 2, [0.3 if k < 3 else 0.6] * 2) for k in range(8)]
-    assert density.told == [pytest.approx([0.06, 0.12])] * 8
-    assert [each[1].tolist() for each in given] == [pytest.approx([0.06, 0.12])] * 8
-    assert [each[2].tolist() for each in given] == [[31.0] * 2] * 3 + [[36.0] * 2] * 5
-    assert {key: values.shape for key, values in found.items()} == dict.fromkeys(found, (2, 8))
-    truth = Plant(config().plants["coculture"], 2, np.random.default_rng(1)).culture
-    np.testing.assert_allclose(found["od"][:, 0], truth.od)  # not as it is read
-    np.testing.assert_allclose(found["share"][:, 0], truth.share)
-    assert (found["low"] < found["estimate"]).all()
-    assert (found["estimate"] < found["high"]).all()
-    assert (np.abs(found["estimate"] - found["share"]).max(axis=1) > 1e-4).all()
+def test_a_share_is_held_behind_the_interlock_of_a_real_run(monkeypatch):
+    """A sensor that repeats itself is not believed for long, whatever the law asks for."""
+    schedule = Scenario((0.3, 0.35), (10.0, 90.0), (31.0, 35.0), ratios=(None, 0.05))
+    monkeypatch.setattr(Plant, "read_od", lambda plant: np.full(plant.n, 0.4))
+    found = run_cell(replace(config(), scenarios={"ratio_steps": schedule}), cell("bang_bang"), None)
+    np.testing.assert_array_equal(found.setpoint, [math.nan] * 10 + [0.05] * 91)
+    assert (np.diff(found.od[:, 9:], axis=1) > 0.0).all(), "undiluted, above the setpoints"
 
 
 def test_each_law_follows_the_policy_that_is_named_for_it(tmp_path):

@@ -5,12 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf import presets
-from conf.schema import build
-from envs.plant.plant import Plant, PlantConfig
-from envs.task import EnvConfig
-from experiments.comparison.trials import calibrate, run_share
-from experiments.laws import registry
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.trials import Cell, run_cell
 from experiments.laws.share.estimator import (
     BIAS_E,
     BIAS_P,
@@ -25,7 +23,6 @@ from experiments.laws.share.estimator import (
     CompositionEstimator,
     CompositionEstimatorConfig,
 )
-from experiments.laws.share.program import Program
 from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 
 pytestmark = pytest.mark.numeric
@@ -119,17 +116,12 @@ def test_it_is_the_dense_solution_where_everything_is_nearly_linear():
     np.testing.assert_allclose(found, exact, rtol=0.15, atol=0.02 * np.diag(exact).max())
 
 
-def closed_loop(plant_name, calibrated, n=32):
-    plant = Plant(build(PlantConfig(), presets.load(f"plant/{plant_name}")), n, np.random.default_rng(0))
-    config = registry.config("proportional", registry.SHARE)
-    estimator, law = CompositionEstimator(config.estimator), registry.build(config, registry.SHARE)
-    estimator.reset(n)
-    law.reset(n)
-    if calibrated:
-        calibrate(estimator, plant, seed=0)
-    density = registry.build(registry.config("inverse"), model=EnvConfig())
-    program = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
-    return run_share(plant, estimator, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
+def closed_loop(plant, calibrated):
+    schedule = Scenario((0.5,) * 4, (60.0, 360.0, 600.0, 600.0), (33.2,) * 4, ratios=(None, 0.3, 0.7, 0.3))
+    scenarios = {"steps": schedule}
+    benchmark = frame.load(frame.compose("benchmark", ["replicates=32"]), BenchmarkConfig())
+    config = replace(benchmark, scenarios=scenarios)
+    return run_cell(config, Cell("proportional", plant, "steps", "share", "inverse", False, calibrated), None)
 
 
 @pytest.mark.slow
@@ -145,9 +137,9 @@ def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, 
     """Where the sensor is not calibrated its constants are drawn from a range that ends within two sds: more often."""
     found = closed_loop(plant, calibrated)
     after = slice(60, None)  # the first guess is the plant's own start here, which is no merit
-    inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
+    inside = (found.low <= found.share) & (found.share <= found.high)
     assert 0.9 <= inside[:, after].mean() <= most
-    assert np.sqrt(np.square(found["estimate"] - found["share"])[:, after].mean()) < rms
+    assert np.sqrt(np.square(found.estimate - found.share)[:, after].mean()) < rms
 
 
 def test_what_is_considered_never_moves_and_always_counts():
