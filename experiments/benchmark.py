@@ -13,7 +13,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     run.benchmark(config, folder)
 
 
-main = frame.Command("benchmark", BenchmarkConfig(), benchmark)
+main = frame.EntryPoint("benchmark", BenchmarkConfig(), benchmark)
 
 
 if __name__ == "__main__":

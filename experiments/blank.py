@@ -63,7 +63,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
     files.write_json(folder / "summary.json", rows)
 
 
-main = frame.Command("blank", BlankConfig(), blank)
+main = frame.EntryPoint("blank", BlankConfig(), blank)
 
 
 if __name__ == "__main__":

@@ -137,7 +137,7 @@ def _generate(config: CalibrateConfig, folder: Path) -> None:
     print(f"{len(time)} rows ({config.law}; mu {protocol.mu:g}, tau {protocol.tau:g}) in {path}")
 
 
-main = frame.Command("calibrate", CalibrateConfig(), body)
+main = frame.EntryPoint("calibrate", CalibrateConfig(), body)
 
 
 if __name__ == "__main__":

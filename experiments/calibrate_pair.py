@@ -14,7 +14,7 @@ from conf.schema import check, require, setting
 from envs.bench import Bench
 from envs.coculture.pair import PairConfig, PigmentConfig, SpeciesConfig
 from envs.identification import curves
-from envs.identification.curves import Curve, Plateau
+from envs.identification.curves import Plateau, Polynomial
 from envs.identification.screening import Series
 from experiments.cli import files, frame
 from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
@@ -94,7 +94,7 @@ def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfi
     return sorted(found, key=lambda p: p.temperature)
 
 
-def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibratePairConfig) -> Curve:
+def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibratePairConfig) -> Polynomial:
     """Fit the growth curve of a species. Raises: UserError for too few temperatures."""
     t = np.array([p.temperature for p in points])
     apart = np.unique(np.round(t)).size
@@ -219,7 +219,7 @@ def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
 
 
 def _say(
-    config: CalibratePairConfig, pair: PairConfig, points: list[list[Plateau]], found: list[Curve],
+    config: CalibratePairConfig, pair: PairConfig, points: list[list[Plateau]], found: list[Polynomial],
     told: dict[str, float] | None, folder: Path,
 ) -> None:  # fmt: skip
     for name, mine, curve in zip(config.names, points, found, strict=True):
@@ -239,7 +239,7 @@ def _say(
     print(f"next: python -m experiments.deploy scenario=ratio_steps pair={folder / 'pair.yaml'}")
 
 
-main = frame.Command("calibrate_pair", CalibratePairConfig(), calibrate_pair)
+main = frame.EntryPoint("calibrate_pair", CalibratePairConfig(), calibrate_pair)
 
 
 if __name__ == "__main__":

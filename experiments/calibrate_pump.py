@@ -24,7 +24,7 @@ from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE, Permitted
 from hardware.errors import ReactorError
 from hardware.logbook import no_log
 
-__all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
+__all__ = ["CalibratePumpConfig", "Weighing", "calibrate", "read_weighings"]
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ LIMITS = {"feed": 0.05, "waste": 0.5}
 
 
 @dataclass(frozen=True)
-class Series:
+class Weighing:
     """One weighing: `doses` doses of 63 s * `duty` weighed `grams`."""
 
     duty: float
@@ -62,7 +62,7 @@ class CalibratePumpConfig:
         require(usable, "duties", self.duties, f"at least two different ones from 0.003 to {limit}")
 
 
-def read_weighings(path: Path) -> list[Series]:
+def read_weighings(path: Path) -> list[Weighing]:
     """Weighings from a CSV file with the columns duty, doses, grams. Raises: UserError naming the line."""
     try:
         with open(path, newline="", encoding="utf-8") as f:
@@ -74,7 +74,7 @@ def read_weighings(path: Path) -> list[Series]:
     found = []
     for number, row in enumerate(rows, 2):
         try:
-            series = Series(float(row["duty"]), int(row["doses"]), float(row["grams"]))
+            series = Weighing(float(row["duty"]), int(row["doses"]), float(row["grams"]))
             if not (0.0 < series.duty <= 1.0 and series.doses >= 1 and 0.0 <= series.grams < 10_000.0):
                 raise ValueError("duty 0 to 1, doses at least 1, grams at least 0")
         except (KeyError, TypeError, ValueError) as error:
@@ -95,7 +95,7 @@ def _number(ask: Callable[[str], str], question: str) -> float:
         print(f"  {answer!r} is no mass in grams; a number from 0 to 10000, please")
 
 
-def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tuple[list[Series], str]:
+def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tuple[list[Weighing], str]:
     """Walk the operator through all series; the weighings and the unit's identity.
 
     Args: ask: puts a question and returns the answer.
@@ -113,12 +113,12 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
             ask(f"\n{config.doses} doses of {PERIOD_S * duty:.2f} s: tare the balance, then press Enter ")
             for given in dose_series(connection, clock, PUMP_OF[config.pump], duty, config.doses):
                 print(f"\r  dose {given} of {config.doses}", end="", flush=True)
-            found.append(Series(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
+            found.append(Weighing(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
         transport.disarm()
     return found, identity
 
 
-def report(fit: PumpFit, found: list[Series]) -> str:
+def report(fit: PumpFit, found: list[Weighing]) -> str:
     """Describe the fit for a person to judge."""
     c = fit.calibration
     lines = [f"{'asked s':>8} {'doses':>6} {'mL/dose':>9} {'fitted':>9}"]
@@ -160,7 +160,7 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 
 
-main = frame.Command("calibrate_pump", CalibratePumpConfig(), calibrate)
+main = frame.EntryPoint("calibrate_pump", CalibratePumpConfig(), calibrate)
 
 
 if __name__ == "__main__":

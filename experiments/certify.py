@@ -128,7 +128,7 @@ def _row(loop: Any, proof: Proof) -> dict[str, Any]:
     }
 
 
-main = frame.Command("certify", CertifyConfig(), body)
+main = frame.EntryPoint("certify", CertifyConfig(), body)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     run.deploy(config, folder)
 
 
-class _Deploy(frame.Command[DeployConfig]):
+class _Deploy(frame.EntryPoint[DeployConfig]):
     """`deploy`, whose `dry_run=true` answers before there is a run folder, and whose hook's address is kept nowhere."""
 
     def _answer(self, given: list[str]) -> None:

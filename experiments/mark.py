@@ -132,7 +132,7 @@ def _quoted(argument: str) -> str:
     return f"{key}='{escaped}'"
 
 
-class _Mark(frame.Command[MarkConfig]):
+class _Mark(frame.EntryPoint[MarkConfig]):
     """A command that works in another run's folder and needs none of its own."""
 
     def _answer(self, given: list[str]) -> None:

@@ -129,7 +129,7 @@ def report(config: ReportConfig, folder: Path) -> None:
         log.info("report %s", write(find(config.run)))
 
 
-main = frame.Command("report", ReportConfig(), report)
+main = frame.EntryPoint("report", ReportConfig(), report)
 
 
 if __name__ == "__main__":

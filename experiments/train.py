@@ -13,7 +13,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     return run.train(config, folder)
 
 
-main = frame.Command("train", TrainConfig(), train, resumes="checkpoint.pt", goes_on=True)
+main = frame.EntryPoint("train", TrainConfig(), train, resumes="checkpoint.pt", goes_on=True)
 
 
 if __name__ == "__main__":

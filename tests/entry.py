@@ -15,12 +15,12 @@ __all__ = ["command"]
 T = TypeVar("T")
 
 
-def command(module: str, schema: T, body: Callable[[T, Path], float | None], resumes: str = "") -> frame.Command[T]:
+def command(module: str, schema: T, body: Callable[[T, Path], float | None], resumes: str = "") -> frame.EntryPoint[T]:
     """The command of a module: `NAME.yaml` beside it has its usage and choices, as conf/NAME.yaml of the program's.
 
-    Args: module: its file. schema, body, resumes: as of `Command`.
+    Args: module: its file. schema, body, resumes: as of `EntryPoint`.
     """
     path = Path(module).with_suffix(".yaml")
     presets.place(path)
     ConfigStore.instance().store(path.stem, yaml.safe_load(path.read_text(encoding="utf-8")))
-    return frame.Command(path.stem, schema, body, resumes=resumes)
+    return frame.EntryPoint(path.stem, schema, body, resumes=resumes)

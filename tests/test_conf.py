@@ -389,7 +389,7 @@ def test_a_value_beside_resume_is_refused_wherever_it_is_typed(where, tmp_path, 
     """What Hydra is told, and nothing else, stands beside it."""
     goes_on = []
     monkeypatch.setattr(sys, "argv", ["train"])
-    monkeypatch.setattr(frame.Command, "_hydra", lambda command: goes_on.append(command.name))
+    monkeypatch.setattr(frame.EntryPoint, "_hydra", lambda command: goes_on.append(command.name))
     (tmp_path / "config.yaml").write_text("seed: 3\n", encoding="utf-8")
     given = [f"resume={tmp_path}", "hydra.verbose=true"]
     main._answer(given)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from envs.identification.model import Parameter
 from envs.identification.screening import Series, screen
 
-__all__ = ["Curve", "Plateau", "fit", "plateaus"]
+__all__ = ["Plateau", "Polynomial", "fit", "plateaus"]
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Plateau:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Polynomial:
     """A polynomial, coefficients highest power first, of T - centre.
 
     off: of each point from it, in sds.
@@ -123,9 +123,9 @@ def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
     return [(a, b) for a, b in [*found, (first, len(time))] if b - a > 1]
 
 
-def fit(temperature: Array, value: Array, sd: Array, degree: int, centre: float = 0.0) -> Curve:
+def fit(temperature: Array, value: Array, sd: Array, degree: int, centre: float = 0.0) -> Polynomial:
     """Fit the weighted least-squares polynomial to points (K,), of a degree less than their number."""
     powers = np.vander(temperature - centre, degree + 1)
     weighted = powers / sd[:, None]
     coefficients, *_ = np.linalg.lstsq(weighted, value / sd, rcond=None)
-    return Curve(tuple(map(float, coefficients)), (value - powers @ coefficients) / sd)
+    return Polynomial(tuple(map(float, coefficients)), (value - powers @ coefficients) / sd)

@@ -14,7 +14,7 @@ from envs.coculture.pair import PairConfig
 from envs.plant.noise import Streams, Tape, uniform
 from envs.plant.sensor import FULL_SCALE
 
-__all__ = ["DAY_MIN", "Fluorescence", "FluorescenceConfig"]
+__all__ = ["DAY_MIN", "FluorescenceConfig", "FluorescenceSensor"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,7 +49,7 @@ class FluorescenceConfig:
         check(self, "plant.fluorescence")
 
 
-class Fluorescence:
+class FluorescenceSensor:
     """N vials' pigment and sensors.
 
       f' = g p - D f          pigment; p is the OD of the second species, D the dilution rate

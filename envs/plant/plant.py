@@ -16,7 +16,7 @@ from envs.growth import REFERENCE_TEMPERATURE
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
 from envs.plant.disturbance import named
-from envs.plant.fluorescence import Fluorescence, FluorescenceConfig
+from envs.plant.fluorescence import FluorescenceConfig, FluorescenceSensor
 from envs.plant.noise import Streams, Tape, streams, uniform
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
@@ -119,7 +119,9 @@ class Plant:
         self.thermal = Thermal(config.thermal, thermometer)
         self.feed.media_left_ml[:] = config.vessel.media_ml
         self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws | self.thermal.draws
-        self.fluorescence = Fluorescence(config.fluorescence, light, config.pair) if config.second.present else None
+        self.fluorescence = (
+            FluorescenceSensor(config.fluorescence, light, config.pair) if config.second.present else None
+        )
         if self.fluorescence is not None:
             self.draws |= self.fluorescence.draws
         self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)

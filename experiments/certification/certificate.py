@@ -14,7 +14,7 @@ from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
-from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Check, recheck, worst
+from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Requirement, recheck, worst
 from experiments.certification.network import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
@@ -46,7 +46,7 @@ class Stored:
     of: Mapping[str, Any]
     safe: bool
     passed: bool
-    failed: tuple[Check, ...]
+    failed: tuple[Requirement, ...]
     config: CertifyConfig
     setpoints: tuple[float, float]
     bounds: EstimateBounds | None
@@ -128,12 +128,14 @@ def load(path: Path) -> Stored:
         raise ValueError(f"{type(error).__name__}: {error}") from None
 
 
-def _check(given: Mapping[str, Any]) -> Check:
+def _check(given: Mapping[str, Any]) -> Requirement:
     """Read a requirement, whose value is null where it was no finite number. Raises: ValueError, KeyError."""
     name, where, kind = (str(given[key]) for key in ("name", "where", "kind"))
     if kind not in KINDS:
         raise ValueError(f"kind {kind} of a requirement: allowed {', '.join(KINDS)}")
-    return Check(name, np.nan if given["value"] is None else float(given["value"]), float(given["limit"]), where, kind)
+    return Requirement(
+        name, np.nan if given["value"] is None else float(given["value"]), float(given["limit"]), where, kind
+    )
 
 
 def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
@@ -245,13 +247,13 @@ def _other_pump(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvC
     return f"it is proven for tau = {tau:.3g} +- {share:.0f} %, this run has tau = {model.tau:.3g} ({remedy})"
 
 
-def _listed(checks: Sequence[Check]) -> str:
+def _listed(checks: Sequence[Requirement]) -> str:
     """Return the worst of each requirement, and how many there are in all."""
     told = "; ".join(map(str, worst(checks)))
     return told if len(checks) < 2 else f"{told} ({len(checks)} in all)"
 
 
-def _short(failed: Sequence[Check], stored: Stored) -> list[str]:
+def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
     """Return what performance lacks, and limits of it that the certificate set wider than by default."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []

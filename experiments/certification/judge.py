@@ -15,7 +15,7 @@ from experiments.certification.polygons import Regions, partition
 from experiments.certification.question import Question, actions, question
 from experiments.certification.verdict import Loop, Proof, attacked, dose_below, prove
 
-__all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Check", "certify", "recheck", "worst"]
+__all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Requirement", "certify", "recheck", "worst"]
 
 KINDS = SAFETY, PERFORMANCE = "safety", "performance"
 GRID = (256, 128)  # boxes of the cross-check
@@ -23,7 +23,7 @@ ENOUGH = 100  # trajectories for each strip, from which on they may be asked to 
 
 
 @dataclass(frozen=True)
-class Check:
+class Requirement:
     """One requirement: the worst value found, where, and the limit it must not exceed.
 
     kind: one of `KINDS`. A device refuses a policy that fails a requirement of safety, and tells one of performance.
@@ -50,16 +50,16 @@ class Check:
         return f"{self.name}: {value}, allowed {self.limit:g}" + (f" ({self.where})" if self.where else "")
 
 
-def worst(checks: Iterable[Check]) -> list[Check]:
+def worst(checks: Iterable[Requirement]) -> list[Requirement]:
     """Return of each title the check that is farthest beyond its limit, relative to it; nan counts as farthest."""
-    found: dict[str, Check] = {}
+    found: dict[str, Requirement] = {}
     for check in checks:
         if check.title not in found or _beyond(check) > _beyond(found[check.title]):
             found[check.title] = check
     return list(found.values())
 
 
-def _beyond(check: Check) -> float:
+def _beyond(check: Requirement) -> float:
     over = (check.value - check.limit) / max(check.limit, 1e-9)
     return float("inf") if np.isnan(over) else over
 
@@ -75,14 +75,14 @@ class Certificate:
 
     question: Question
     proofs: tuple[Proof, ...]
-    checks: tuple[Check, ...]
+    checks: tuple[Requirement, ...]
     levels: tuple[int, ...]
     doses: Array
     drops: list[tuple[float, float, int, int]]
     regions: Regions
     quick: bool
 
-    def failed(self, kind: str) -> list[Check]:
+    def failed(self, kind: str) -> list[Requirement]:
         """Return the requirements of a kind that are not met."""
         return [check for check in self.checks if check.kind == kind and not check.holds]
 
@@ -110,7 +110,7 @@ class Certificate:
 
     def told(self) -> list[str]:
         """Every requirement that fails, and of each title that is met the case that comes closest to its limit."""
-        titles: dict[str, list[Check]] = {}
+        titles: dict[str, list[Requirement]] = {}
         for check in self.checks:
             titles.setdefault(check.title, []).append(check)
         lines = []
@@ -145,7 +145,7 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
     levels = (1, 2, _half(policy))
     doses = dose_below(asked.loop, points(asked.cases[0]), wider.action, asked.cases[0], levels)
     checks = (
-        Check("polygons that the bounds of boxes contradict", contradictions(network, exact, GRID), 0),
+        Requirement("polygons that the bounds of boxes contradict", contradictions(network, exact, GRID), 0),
         *_required(asked, proofs, doses[-1], config.limits),
         *_attacks(policy, asked, proofs, config.trajectories),
     )
@@ -158,28 +158,28 @@ def _half(policy: Policy) -> int:
     return int(np.argmax(grid >= (0.5 - 1e-9) * grid[-1]))
 
 
-def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Check]:
+def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Requirement]:
     """Attack every case: check whether a band is left, and whether it is wider than necessary."""
     once = {asked.loop.key(proof.case): proof for proof in reversed(proofs)} if trajectories else {}
     proofs = [proof for proof in proofs if proof in once.values()]
     found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs]
     if found:
-        yield Check("adversarial trajectories that left the band", sum(left for left, _ in found), 0)
+        yield Requirement("adversarial trajectories that left the band", sum(left for left, _ in found), 0)
     if asked.reached is None or trajectories < ENOUGH * asked.loop.low.size:
         return
     for least, named, some in zip(asked.reached, ("exact", "errors"), (slice(1), slice(1, None)), strict=True):
         worst = [
-            Check(proof.case.name, float(np.nanmax(1.0 - share)), 0.0, _strip(asked, int(np.nanargmin(share))))
+            Requirement(proof.case.name, float(np.nanmax(1.0 - share)), 0.0, _strip(asked, int(np.nanargmin(share))))
             for proof, (_, share) in list(zip(proofs, found, strict=False))[some]
             if np.isfinite(share).any()
         ]
         if worst:
             most = max(worst, key=lambda check: check.value)
             title = f"{named}: share of the band that no attack reaches"
-            yield Check(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}", PERFORMANCE)
+            yield Requirement(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}", PERFORMANCE)
 
 
-def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Check]:
+def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Requirement]:
     """Every requirement with its worst strip. What the pump cannot hold fails in the nominal model alone.
 
     dose: how far below the setpoint half of the largest dose may be given, periods of growth, (S,).
@@ -189,7 +189,7 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
     if asked.median is not None:
         middle = float(np.median(np.nan_to_num(proofs[0].excess, nan=np.inf)))
         title = f"nominal: median half-width over that of the law, safety, {asked.unit}"
-        yield Check(title, middle, asked.median, f"all {asked.what}s")
+        yield Requirement(title, middle, asked.median, f"all {asked.what}s")
     for proof in proofs:
         name, held = proof.case.name, proof.holdable
         if not held.any():
@@ -211,18 +211,18 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
     yield _worst(f"{title}, safety, periods of growth", asked, dose, limits.safe_low_dose, every)
 
 
-def _count(name: str, asked: Question, wrong: Mask) -> Check:
+def _count(name: str, asked: Question, wrong: Mask) -> Requirement:
     """Count strips that must not exist."""
     where = ", ".join(_place(asked, low, high) for low, high in _runs(asked.loop, wrong))
-    return Check(name, float(wrong.sum()), 0.0, where)
+    return Requirement(name, float(wrong.sum()), 0.0, where)
 
 
-def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask, kind: str = SAFETY) -> Check:
+def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask, kind: str = SAFETY) -> Requirement:
     """Take the largest value in some strips; nan (nothing could be proven) is the worst."""
     if not where.any():
-        return Check(name, 0.0, limit, kind=kind)
+        return Requirement(name, 0.0, limit, kind=kind)
     at = int(np.where(where, np.where(np.isnan(value), np.inf, value), -np.inf).argmax())
-    return Check(name, float(value[at]), limit, _strip(asked, at), kind)
+    return Requirement(name, float(value[at]), limit, _strip(asked, at), kind)
 
 
 def _strip(asked: Question, at: int) -> str:
@@ -233,7 +233,7 @@ def _place(asked: Question, low: float, high: float) -> str:
     return f"{asked.what} {low:.4g}" + (f" to {high:.4g}" if high > low else "")
 
 
-def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Check]:
+def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
     """List the requirements that a policy fails at single setpoints, without an attack on its bands.
 
     Of a policy of the OD along their lines, which need no polygons: another way to the same numbers.

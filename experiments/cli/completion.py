@@ -7,7 +7,7 @@ from typing import Any
 
 from conf.presets import chosen, options
 from conf.schema import entries
-from experiments.cli.frame import Command, UserError
+from experiments.cli.frame import EntryPoint, UserError
 
 __all__ = ["SHELLS", "candidates"]
 
@@ -60,7 +60,7 @@ def candidates(line: str, commands: list[str]) -> list[str]:
 
 def _of_command(name: str, before: list[str], last: str) -> Iterator[str]:
     command = getattr(importlib.import_module(f"experiments.{name}"), "main", None)
-    if not isinstance(command, Command):
+    if not isinstance(command, EntryPoint):
         yield "--help"
         return
     key, given, _ = last.partition("=")
@@ -73,7 +73,7 @@ def _of_command(name: str, before: list[str], last: str) -> Iterator[str]:
     yield from (word for word in own if word.partition("=")[0] not in groups)
 
 
-def _config(command: Command[Any], words: list[str]) -> Any:
+def _config(command: EntryPoint[Any], words: list[str]) -> Any:
     """Compose the config of the rest of the line; the default where the line is not valid yet."""
     try:
         return command.config([w for w in words if not w.startswith("-")])

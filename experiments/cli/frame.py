@@ -32,7 +32,7 @@ from experiments.cli import extensions, files, help_page, latest, search, stop, 
 from experiments.cli.start import stopped, version
 from experiments.cli.words import UserError, normalise, refusing
 
-__all__ = ["Command", "UserError", "compose", "load", "normalise", "refusing", "save_config", "swept"]
+__all__ = ["EntryPoint", "UserError", "compose", "load", "normalise", "refusing", "save_config", "swept"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -171,7 +171,7 @@ def _stored(path: Path, resume: str, schema: T) -> T:
 
 
 @dataclass(frozen=True)
-class Command(Generic[T]):
+class EntryPoint(Generic[T]):
     """An entry point, called to run; its resolved config is in `config.yaml` of its run folder before `body` starts.
 
     name: of `conf/<name>.yaml` and of the job.
@@ -211,7 +211,7 @@ class Command(Generic[T]):
                 line = f"{error.filename}: {error.strerror}; {PLACE}"
             if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
                 line = _one_line(error)  # a ValueError is the schema's own word on a value
-            inside = any(stack.f_code is Command._job.__code__ for stack, _ in walk_tb(error.__traceback__))
+            inside = any(stack.f_code is EntryPoint._job.__code__ for stack, _ in walk_tb(error.__traceback__))
             if line is None or inside:  # a bug of ours, shown whole
                 raise
             print(f"error: {line}", file=sys.stderr)

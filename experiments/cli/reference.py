@@ -13,7 +13,7 @@ import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, chosen, commands, groups, owner, sentence
 from conf.schema import Entry, entries
-from experiments.cli.frame import Command
+from experiments.cli.frame import EntryPoint
 from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 from experiments.reporting.tables import markdown
@@ -37,7 +37,7 @@ part is written with the part's name before it: `bench.max_rate=0.01`.
 
 def page() -> str:
     """Write the whole page."""
-    known: dict[str, Command[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
+    known: dict[str, EntryPoint[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
     parts: dict[type[Any], str] = {}
     for command in known.values():
         for config in _variants(command):
@@ -69,7 +69,7 @@ def _anchor(heading: str) -> str:
     return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
 
 
-def _variants(command: Command[Any]) -> Iterator[Any]:
+def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
     """Yield the command's config with every kind of backend and controller that it may hold."""
     yield command.config()
     for group in ("backend", "controller", "composition"):

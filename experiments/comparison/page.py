@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from experiments.comparison.config import TABLE_2
 from experiments.reporting.page import Page, provenance
-from experiments.reporting.tables import Best, Table, count, number, plus_minus
+from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
 __all__ = ["SECTIONS", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "table_2"]
 
@@ -85,7 +85,7 @@ def _lowest(values: Mapping[str, float]) -> str:
 
 
 def _mark(text: str, best: bool) -> str:
-    return Best(text) if best else text
+    return Emphasis(text) if best else text
 
 
 def beside(summary: Row) -> list[Row]:

@@ -29,7 +29,7 @@ from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
 from experiments.cli.files import choices
 from experiments.control.config import DeployConfig
-from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
+from experiments.control.policies import WantedPolicy, admit, composition_policy, policy_check, run_policy
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.laws.share.estimator import CompositionEstimator
@@ -37,7 +37,7 @@ from experiments.laws.share.program import Program
 from experiments.laws.share.recall import Recall
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
-from experiments.loop.share import Light, Share, program_of
+from experiments.loop.share import LightSignal, Share, program_of
 from experiments.loop.signals import Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop, is_over
@@ -81,7 +81,7 @@ class Setup:
     plant: PlantConfig
     model: EnvConfig
     law: Any
-    wanted: Wanted | None
+    wanted: WantedPolicy | None
     policy: Policy | None
     bounds: EstimateBounds | None
     further: list[Signal]
@@ -203,7 +203,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
         changes = config.controller.estimator
         stake = config.poor_regret_pct, family.at_stake, config.force_policy
-        wanted = Wanted(config.policy, bench, model, changes, asked, *stake)
+        wanted = WantedPolicy(config.policy, bench, model, changes, asked, *stake)
     if wanted is not None and not config.preflight_only:
         policy = run_policy(wanted, folder, resumed)
         admit(policy, folder / "policy.npz", wanted, resumed)
@@ -285,7 +285,7 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
         own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
         vials = family_of(config.backend).vials(config.backend, plant)
         lit = family_of(config.backend).sees_fluorescence(config.backend) or (vials and vials[1].second.present)
-        light = [Light()] if lit and not share and not own else []
+        light = [LightSignal()] if lit and not share and not own else []
         family, made = family_of(config.backend), [*share, *light, *own]
         actuators = {actuator.name: actuator for actuator in family.actuators(config.backend)}
         signals.fitting(made, list(actuators.values()))

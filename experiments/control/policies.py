@@ -24,7 +24,7 @@ from hardware.family import Check
 from hardware.storage import atomic
 
 __all__ = [
-    "COMPOSITION_POLICY", "SHIPPED", "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy",
+    "COMPOSITION_POLICY", "SHIPPED", "SHIPPED_COMPOSITION", "Training", "WantedPolicy", "admit", "composition_policy",
     "find_policy", "load_policy", "policy_check", "run_policy",
 ]  # fmt: skip
 
@@ -46,7 +46,7 @@ class NoPolicyError(frame.UserError):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WantedPolicy:
     """The policy that a run is to have, and what that run asks of it.
 
     name: as of `find_policy`. bench: with the control period and the largest pump rate that the interlock allows.
@@ -171,7 +171,7 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     return policy
 
 
-def admit(policy: Policy, file: Path, wanted: Wanted, resumed: bool) -> None:
+def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> None:
     """Refuse a policy that is not proven to be safe for this run, and warn of all else that speaks against it.
 
     Args: file: of the policy, beside which its certificate lies.
@@ -184,7 +184,7 @@ def admit(policy: Policy, file: Path, wanted: Wanted, resumed: bool) -> None:
         log.warning("policy: %s", reason)
 
 
-def _judged(policy: Policy, file: Path, wanted: Wanted) -> Opinion:
+def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:
     """Judge a policy by its certificate where a culture is at stake; what its training lacks is told, not refused."""
     training = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
     if not wanted.at_stake:
@@ -196,7 +196,7 @@ def _judged(policy: Policy, file: Path, wanted: Wanted) -> Opinion:
     return Opinion(found.refused, found.short + training)
 
 
-def policy_check(wanted: Wanted) -> Check:
+def policy_check(wanted: WantedPolicy) -> Check:
     """Return the policy's line of a preflight. A policy that falls short only in performance passes, with its numbers.
 
     That no policy has been trained yet does not stop a look at the device.
@@ -217,7 +217,7 @@ def policy_check(wanted: Wanted) -> Check:
     return Check("policy", False, told, remedy, wanted.refuses)
 
 
-def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:
+def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> Policy:
     """Load the policy of a run; the run folder keeps a copy with its certificate, which a resumed run uses.
 
     The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.

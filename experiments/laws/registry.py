@@ -36,7 +36,7 @@ from experiments.laws.share.learned import LearnedLaw, LearnedLawConfig, Preview
 from experiments.laws.share.planned import Optimum, OptimumConfig, Receding, RecedingConfig
 from experiments.laws.share.program import Program
 
-__all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "Kind", "add", "build", "config", "on_device", "takes"]
+__all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "LawKind", "add", "build", "config", "on_device", "takes"]
 
 DENSITY, SHARE = "density", "share"
 GROUPS = {DENSITY: "controller", SHARE: "composition"}  # of presets, and key of the config
@@ -53,7 +53,7 @@ FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")
 
 
 @dataclass(frozen=True)
-class Kind:
+class LawKind:
     """A law: the class of its config, what makes it, and the parts with which that is called after the config."""
 
     config: type[Any]
@@ -61,28 +61,28 @@ class Kind:
     parts: tuple[str, ...] = ()
 
 
-KINDS: dict[str, dict[str, Kind]] = {
+KINDS: dict[str, dict[str, LawKind]] = {
     DENSITY: {
-        "dqn": Kind(LearnedConfig, learned, ("policy", "model", "bounds")),
-        "pi": Kind(ChiBioPIConfig, ChiBioPI, ("volume_ml",)),
-        "pi_tuned": Kind(TunedPIConfig, TunedPI, ("model",)),
-        "mpc": Kind(MpcConfig, Mpc, ("model",)),
-        "inverse": Kind(InverseConfig, Inverse, ("model",)),
-        "threshold": Kind(ThresholdConfig, Threshold),
-        "hold": Kind(HoldConfig, Hold, ("model",)),
-        "oracle": Kind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
+        "dqn": LawKind(LearnedConfig, learned, ("policy", "model", "bounds")),
+        "pi": LawKind(ChiBioPIConfig, ChiBioPI, ("volume_ml",)),
+        "pi_tuned": LawKind(TunedPIConfig, TunedPI, ("model",)),
+        "mpc": LawKind(MpcConfig, Mpc, ("model",)),
+        "inverse": LawKind(InverseConfig, Inverse, ("model",)),
+        "threshold": LawKind(ThresholdConfig, Threshold),
+        "hold": LawKind(HoldConfig, Hold, ("model",)),
+        "oracle": LawKind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
     },
     SHARE: {
-        "dqn": Kind(LearnedLawConfig, LearnedLaw, ("policy", "pair")),
-        "dqn_preview": Kind(PreviewLawConfig, LearnedLaw, ("policy", "pair")),
-        "pi": Kind(PIConfig, PI, ("pair",)),
-        "proportional": Kind(ProportionalConfig, Proportional, ("pair",)),
-        "inverse_dynamics": Kind(InverseDynamicsConfig, InverseDynamics, ("pair",)),
-        "bang_bang": Kind(BangBangConfig, BangBang, ("pair",)),
-        "myopic": Kind(MyopicConfig, Myopic, ("pair",)),
-        "midpoint": Kind(MidpointConfig, Midpoint, ("pair",)),
-        "receding": Kind(RecedingConfig, Receding, ("pair",)),
-        "optimum": Kind(OptimumConfig, Optimum, ("program", "pair")),
+        "dqn": LawKind(LearnedLawConfig, LearnedLaw, ("policy", "pair")),
+        "dqn_preview": LawKind(PreviewLawConfig, LearnedLaw, ("policy", "pair")),
+        "pi": LawKind(PIConfig, PI, ("pair",)),
+        "proportional": LawKind(ProportionalConfig, Proportional, ("pair",)),
+        "inverse_dynamics": LawKind(InverseDynamicsConfig, InverseDynamics, ("pair",)),
+        "bang_bang": LawKind(BangBangConfig, BangBang, ("pair",)),
+        "myopic": LawKind(MyopicConfig, Myopic, ("pair",)),
+        "midpoint": LawKind(MidpointConfig, Midpoint, ("pair",)),
+        "receding": LawKind(RecedingConfig, Receding, ("pair",)),
+        "optimum": LawKind(OptimumConfig, Optimum, ("program", "pair")),
     },
 }
 
@@ -106,10 +106,10 @@ def add(
         raise ValueError(f"{signal}, law {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(PARTS)}")
     if signal in GROUPS:
         presets.add(f"{GROUPS[signal]}/{kind}", {"kind": kind}, what)
-    KINDS.setdefault(signal, {})[kind] = Kind(config, make, tuple(parts))
+    KINDS.setdefault(signal, {})[kind] = LawKind(config, make, tuple(parts))
 
 
-def _kind(kind: str, signal: str) -> Kind:
+def _kind(kind: str, signal: str) -> LawKind:
     if kind not in KINDS.get(signal, {}):
         key = f"{GROUPS.get(signal, f'signals.{signal}')}.kind"
         missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(KINDS)}"

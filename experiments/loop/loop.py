@@ -20,7 +20,7 @@ from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.memory import Remembers
 from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import RAW_MAX, Response
-from hardware.safety.interlock import Interlock, Verdict
+from hardware.safety.interlock import Interlock, Ruling
 
 __all__ = ["ClosedLoop", "Step"]
 
@@ -244,7 +244,7 @@ class ClosedLoop:
             if isinstance(signal, Counted):
                 signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))
 
-    def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
+    def _respond(self, verdict: Ruling, left: Mask) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.
 
         Args: left: reactors that are to be left to their own regulation from now on, shape (N,).

@@ -17,7 +17,7 @@ from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
-__all__ = ["COLUMNS", "TRUE", "Light", "Share", "ShareWarnings", "program_of"]
+__all__ = ["COLUMNS", "TRUE", "LightSignal", "Share", "ShareWarnings", "program_of"]
 
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
@@ -57,7 +57,7 @@ def program_of(schedule: Scenario) -> Program:
     return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
 
 
-class Light:
+class LightSignal:
     """The fluorescence of reactors whose share nobody holds: recorded, and nothing done about it."""
 
     name, actuator, columns, memory = "fluorescence", "", COLUMNS[:1], None

@@ -24,7 +24,7 @@ from hardware.storage.journal import Journal
 from hardware.storage.marks import Mark, read_marks
 from hardware.storage.recorder import Recorder
 
-__all__ = ["Record", "Table"]
+__all__ = ["Record", "Recordings"]
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ AFTERWARDS = "resume=RUN writes it anew from the journal once the run has ended"
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class Recordings:
     """The recordings of a run side by side.
 
     names: of the reactors. columns: NAME -> (N, K); shorter recordings end in nan. rows: of each reactor, with what the
@@ -151,7 +151,7 @@ class Record:
             own[: len(rows)] = rows.columns[column]
         return values
 
-    def table(self) -> Table:
+    def table(self) -> Recordings:
         """All recordings; a damaged file of marks is said and costs nothing else."""
         try:
             marks = sorted(read_marks(self.folder), key=lambda mark: mark.time_min)
@@ -159,7 +159,7 @@ class Record:
             log.warning("%s", error)
             marks = []
         columns = {key: self.series(key) for key in self.columns if key != "interlock"}
-        return Table(self.names, columns, self.rows, self.repairs, marks)
+        return Recordings(self.names, columns, self.rows, self.repairs, marks)
 
     def close(self) -> None:
         """Close all files. Idempotent."""

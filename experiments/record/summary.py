@@ -15,7 +15,7 @@ from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
 from experiments.loop.share import program_of
 from experiments.loop.signals import FILTER_ALARM
-from experiments.record.record import Table
+from experiments.record.record import Recordings
 from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_charts import composition_figure
@@ -149,7 +149,7 @@ def reasons_line(rows: Rows) -> str:
 
 
 def summarise(
-    table: Table,
+    table: Recordings,
     scenarios: Sequence[Scenario],
     roles: Sequence[str],
     outcome: str,
@@ -181,7 +181,7 @@ def summarise(
     }
 
 
-def _windows(table: Table, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
+def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
     """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
     elapsed, od = table.columns["elapsed_min"], table.od()
     rows = []
@@ -199,7 +199,7 @@ def _windows(table: Table, scenarios: Sequence[Scenario], progress: Progress) ->
     return rows
 
 
-def _further(table: Table, n: int, start: float, end: float) -> dict[str, Any]:
+def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, Any]:
     """How well reactor n's further signals, as estimated and, where it is known, in truth, and its OD followed.
 
     A signal has a column NAME, maybe true_NAME, and NAME_setpoint; None where none or more than one was asked for.
@@ -235,12 +235,12 @@ def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) if kept else ""
 
 
-def _setpoint(table: Table) -> Array:
+def _setpoint(table: Recordings) -> Array:
     """Return the setpoint of the OD, nan in a recovery, which has none; (N, K)."""
     return np.where(table.columns["phase"] >= 0, table.columns["setpoint"], np.nan)
 
 
-def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure:
+def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> Figure:
     """OD over setpoint, pump rate and, where a scenario changes it, temperature of all reactors."""
     c = table.columns
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
@@ -250,7 +250,7 @@ def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure
     return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
 
 
-def composition_figure_of(table: Table, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
+def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
     """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
     announced, counted = [], []
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):

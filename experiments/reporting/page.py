@@ -20,8 +20,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from experiments.cli.files import given
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
-from experiments.reporting.tables import Best, Table, number, typeset
-from experiments.reporting.verdict import Verdict, verdict
+from experiments.reporting.tables import Emphasis, Table, number, typeset
+from experiments.reporting.verdict import Headline, verdict
 
 __all__ = ["Page", "flat", "of_runs", "provenance", "save"]
 
@@ -45,7 +45,7 @@ ENDINGS = {"_pct": "%", "_min": "min", "_ml": "mL", "_s": "s"}
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
 templates.filters["typeset"] = typeset
-templates.tests["best"] = lambda cell: isinstance(cell, Best)
+templates.tests["best"] = lambda cell: isinstance(cell, Emphasis)
 
 
 @dataclass
@@ -191,7 +191,7 @@ def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
     return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
 
 
-def _told(runs: Iterable[Path]) -> list[Verdict]:
+def _told(runs: Iterable[Path]) -> list[Headline]:
     """List the verdicts of the runs that have one."""
     found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
     return [said for said in found if said is not None]

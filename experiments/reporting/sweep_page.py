@@ -7,7 +7,7 @@ from pathlib import Path
 from experiments.reporting import charts, sweep_charts
 from experiments.reporting.page import Page
 from experiments.reporting.sweep_results import MERIT, Configuration, Result, configurations, curve, label, statistics
-from experiments.reporting.tables import Best, Table, number
+from experiments.reporting.tables import Emphasis, Table, number
 
 __all__ = ["of_sweep", "repeats"]
 
@@ -43,7 +43,7 @@ def _cells(one: Configuration, name: str) -> list[str]:
 
 def _row(place: int, one: Configuration, names: Sequence[str]) -> tuple[str, ...]:
     cells = [f"#{place}", *map(number_or_text, one.values.values()), *(c for name in names for c in _cells(one, name))]
-    return tuple(Best(cell) if place == 1 else cell for cell in cells)
+    return tuple(Emphasis(cell) if place == 1 else cell for cell in cells)
 
 
 def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str], str], note: str) -> None:

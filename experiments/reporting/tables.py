@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Table", "clock", "count", "markdown", "number", "plus_minus", "span", "typeset", "write"]
+__all__ = ["Emphasis", "Table", "clock", "count", "markdown", "number", "plus_minus", "span", "typeset", "write"]
 
 LONG_MIN = 180.0  # what lasts longer is told in hours
 
 
-class Best(str):
+class Emphasis(str):
     """The text of a cell that stands out."""
 
     __slots__ = ()
@@ -66,7 +66,7 @@ def typeset(text: str) -> str:
 class Table:
     """Table with headings and rows, written in several formats.
 
-    name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Best`; the first names
+    name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Emphasis`; the first names
     the row.
 
     Raises: ValueError for a row of another length than the headings.
@@ -116,7 +116,7 @@ TEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#"
 
 def _tex(text: str) -> str:
     plain = "".join(TEX.get(character, character) for character in text)
-    return rf"\textbf{{{plain}}}" if isinstance(text, Best) else plain
+    return rf"\textbf{{{plain}}}" if isinstance(text, Emphasis) else plain
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.reporting.curves import BAND, ERROR_UNITS
 from experiments.reporting.tables import count, number
 
-__all__ = ["REMEDY", "Verdict", "verdict"]
+__all__ = ["REMEDY", "Headline", "verdict"]
 
 Summary = Mapping[str, Any]
 REGRET, STEADY = 0.5, 0.003
@@ -26,7 +26,7 @@ SHOWN = 3  # requirements that fail, at first sight
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Headline:
     """claim: what was run. items: what came out, each with its unit. remark: good or not, against which limit."""
 
     claim: str
@@ -34,7 +34,7 @@ class Verdict:
     remark: str = ""
 
 
-def verdict(summary: Summary, config: Mapping[str, Any]) -> Verdict | None:
+def verdict(summary: Summary, config: Mapping[str, Any]) -> Headline | None:
     """Of a training, deployment, calibration or certificate; None for any other run, or one that is not whole."""
     for key, of in KINDS.items():
         if key in summary:
@@ -49,7 +49,7 @@ def _within(holds: bool) -> str:
     return "within" if holds else "beyond"
 
 
-def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     regret, steady, env = np.array(summary["regret_pct"]), np.array(summary["steady_abs_error"]), config["env"]
     agents = f"{regret.size} agents" if regret.size > 1 else f"one agent, seed {summary['seeds'][0]},"
     kind = env.get("kind", "density")
@@ -65,9 +65,9 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
         f"{number(summary['myopic_steady_abs_error'])} {unit}",
     ]
     if kind != "density":
-        return Verdict(claim, items)
+        return Headline(claim, items)
     good = float(regret.max()) <= REGRET, float(steady.max()) <= STEADY
-    return Verdict(
+    return Headline(
         claim,
         items,
         f"{'Good' if all(good) else 'Not good yet'}: the regret is {_within(good[0])} the limit of {REGRET:g} %, the "
@@ -75,7 +75,7 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     )
 
 
-def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
     from hardware.family import family, known  # and with it the plant, only where a deployment is reported
 
     windows: Sequence[Summary] = summary["windows"]
@@ -93,15 +93,15 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     if shares:
         items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")
     if not steady:
-        return Verdict(claim, items, "No window was long enough to say how well its setpoint was held.")
+        return Headline(claim, items, "No window was long enough to say how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
     items.insert(0, f"largest error at rest {number(worst)} OD, the mean over the last 10 min of a window")
     held = sum(error <= BAND for error in steady)
     word = "Good" if held == len(windows) else "Not good"
-    return Verdict(claim, items, f"{word}: {held} of {len(windows)} windows ended within 5 % of their setpoint.")
+    return Headline(claim, items, f"{word}: {held} of {len(windows)} windows ended within 5 % of their setpoint.")
 
 
-def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
     data = Path(config["data"]).name if config.get("data") else "the shipped recording"
     said = summary["verdict"]
     claim = f"Calibration of {data}: " + "; ".join(filter(None, (f"{said['word']}: {said['why']}", said["then"]))) + "."
@@ -113,7 +113,7 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
             for name, p in alone
             if p is not None
         ]
-        return Verdict(claim, told, "; ".join(summary["notes"]))
+        return Headline(claim, told, "; ".join(summary["notes"]))
     mu, tau = ((p["value"], *p["ci95"]) for p in (summary["mu"], summary["tau"]))
     items = [
         f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
@@ -123,10 +123,10 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
         f"{summary['n_rejected']} rejected",
     ]
     against = "; ".join(summary["warnings"])
-    return Verdict(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")
+    return Headline(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")
 
 
-def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
     checks: Sequence[Any] = summary["checks"]
     claim = f"Certificate of a policy for {', '.join(summary['observation'])}."
     unsafe = not all(check["holds"] for check in checks if check["kind"] == "safety")
@@ -134,9 +134,9 @@ def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     items = [f"{len(checks)} requirements were judged, listed below", *(f"fails: {name}" for name in failed[:SHOWN])]
     items += [f"and {len(failed) - SHOWN} more fail"] * (len(failed) > SHOWN)
     if not failed:
-        return Verdict(claim, items, "Good: safe, and every requirement of performance is met.")
+        return Headline(claim, items, "Good: safe, and every requirement of performance is met.")
     said = "Not safe: a device refuses it" if unsafe else "Safe: a device runs it, but its performance falls short"
-    return Verdict(claim, items, f"{said}. What helps: {REMEDY}.")
+    return Headline(claim, items, f"{said}. What helps: {REMEDY}.")
 
 
 KINDS = {

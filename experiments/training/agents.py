@@ -21,7 +21,7 @@ Streams = Mapping[str, Sequence[np.random.SeedSequence]]
 """By name, one per agent."""
 
 
-class Kind(NamedTuple):
+class AgentKind(NamedTuple):
     """What makes agents from config, task, streams and device, and the names of the streams that it needs."""
 
     make: Callable[[Any, Task, Streams, str], Agent]
@@ -45,7 +45,7 @@ def _dqn(config: DQNConfig, task: Task, streams: Streams, device: str) -> DQNAge
     return DQNAgent(config, seen, task.actions.size, streams, task.hindsight(config), device)
 
 
-KINDS: dict[type[Any], Kind] = {DQNConfig: Kind(_dqn, STREAMS)}
+KINDS: dict[type[Any], AgentKind] = {DQNConfig: AgentKind(_dqn, STREAMS)}
 
 
 def add(
@@ -64,7 +64,7 @@ def add(
     if kind in AGENTS:
         raise ValueError(f"agent {kind}: there is one of this name already; choose another")
     presets.add(f"agent/{kind}", {"kind": kind}, what)
-    AGENTS[kind], KINDS[config] = config, Kind(make, tuple(streams))
+    AGENTS[kind], KINDS[config] = config, AgentKind(make, tuple(streams))
 
 
 def names(config: Any) -> tuple[str, ...]:

@@ -18,13 +18,13 @@ from envs.vector_env import BioreactorVectorEnv
 from experiments.reporting import charts
 from experiments.training.evaluation import Rollout, each, pairs, rollout
 
-__all__ = ["Density", "first_actions"]
+__all__ = ["DensityTask", "first_actions"]
 
 Array = NDArray[np.float64]
 COARSE = 2e-3  # of log OD: enough for a picture
 
 
-class Density:
+class DensityTask:
     """See `Task`; arguments and errors of every method are described there."""
 
     observation: tuple[str, ...] = ABSOLUTE

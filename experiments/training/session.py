@@ -24,12 +24,12 @@ from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, Score
 from experiments.training.tasks import Task
 
-__all__ = ["Best", "Session", "merit"]
+__all__ = ["BestSoFar", "Session", "merit"]
 
 log = logging.getLogger(__name__)
 
 LINES = 20  # of progress where there is no terminal
-PER_AGENT = ("merit", "regret", "steady", "step", "updates")  # arrays of `Best`, (S,)
+PER_AGENT = ("merit", "regret", "steady", "step", "updates")  # arrays of `BestSoFar`, (S,)
 
 
 def merit(score: Score, task: Task) -> NDArray[np.float64]:
@@ -42,7 +42,7 @@ def merit(score: Score, task: Task) -> NDArray[np.float64]:
 
 
 @dataclass
-class Best:
+class BestSoFar:
     """For each agent the weights that scored best on the selection grid so far, and every score."""
 
     weights: torch.Tensor  # (S, P)
@@ -55,7 +55,7 @@ class Best:
     """Step, regret_pct and steady_abs_error of every evaluation, per agent."""
 
     @classmethod
-    def empty(cls, weights: torch.Tensor) -> Best:
+    def empty(cls, weights: torch.Tensor) -> BestSoFar:
         """Nothing scored yet; `weights` (S, P) stand until something is."""
         n = weights.shape[0]
         worst = np.full((3, n), np.inf)
@@ -102,7 +102,7 @@ class Session:
         self.task = tasks.of(config.env)
         self.agents = build.population(self.task, config.agent, self.seeds, config.device, config.threads)
         self.selection = Evaluation(self.task, self.task.selection_grid())
-        self.best = Best.empty(self.agents.weights())
+        self.best = BestSoFar.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
         if resume:

@@ -17,7 +17,7 @@ from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.training.coculture import Coculture
 from experiments.training.config import ENVS
-from experiments.training.density import Density
+from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluated
 from experiments.training.relative import Relative
 
@@ -73,7 +73,7 @@ class Task(Evaluated, Protocol):
 
 
 TASKS: dict[type[Any], Callable[[Any], Task]] = {
-    EnvConfig: Density,
+    EnvConfig: DensityTask,
     RelativeConfig: Relative,
     CocultureConfig: Coculture,
 }

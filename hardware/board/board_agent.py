@@ -252,7 +252,7 @@ class Device:
 # -- the switch ----------------------------------------------------------------------------------------------------
 
 
-class Agent:
+class BoardAgent:
     """Carries the requests of one client to the device and turns the pumps off when they stop coming.
 
     Args: device; deadman_s: allowed silence; probe: end a pass with a request that unmasks a dead bus.
@@ -428,7 +428,7 @@ class SerialPort:
     Raises: ValueError for a rate the system does not know.
     """
 
-    def __init__(self, path: str, baud: int, agent: Agent) -> None:
+    def __init__(self, path: str, baud: int, agent: BoardAgent) -> None:
         if not hasattr(termios, f"B{baud}"):
             raise ValueError(f"baud = {baud}: allowed the usual rates, e.g. 115200")
         self._path, self._agent = path, agent
@@ -588,7 +588,7 @@ class Proxy(socketserver.ThreadingTCPServer):
     allow_reuse_address = True
     request_queue_size = CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], agent: Agent, token: bytes, names: Iterable[str]) -> None:
+    def __init__(self, address: tuple[str, int], agent: BoardAgent, token: bytes, names: Iterable[str]) -> None:
         self.agent, self.token = agent, token
         self.names = {"localhost", "127.0.0.1", address[0].lower(), *(name.lower() for name in names)}
         self._strangers: dict[socket.socket, None] = {}  # who has not shown the token yet, the oldest first
@@ -736,7 +736,7 @@ def main(argv: list[str] | None = None) -> int:
         for key, value in (("deadman", arguments.deadman), ("http-timeout", arguments.http_timeout)):
             if not 0.0 < value <= 86400.0:
                 raise ValueError(f"{key} = {value:g} s: allowed more than 0, up to 86400")
-        agent = Agent(Device(arguments.url, arguments.http_timeout), arguments.deadman, not arguments.no_probe)
+        agent = BoardAgent(Device(arguments.url, arguments.http_timeout), arguments.deadman, not arguments.no_probe)
         port = SerialPort(arguments.tty, arguments.baud, agent) if arguments.tty else None
         if arguments.http:
             host, _, number = arguments.http.rpartition(":")

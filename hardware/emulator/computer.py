@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Event", "EventQueue", "LinkFaults", "ProcessDied", "Steps"]
+__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Due", "EventQueue", "LinkFaults", "ProcessDied", "Steps"]
 
 Steps = Generator[float, None, None]
 
@@ -33,7 +33,7 @@ class ProcessDied(Exception):
     """The software ended itself (exit code 4)."""
 
 
-class Event(NamedTuple):
+class Due(NamedTuple):
     """A generator that is due. `life` is the software process it belongs to, or HARDWARE; `owner` names it."""
 
     at: float
@@ -48,19 +48,19 @@ class EventQueue:
 
     def __init__(self, now: float) -> None:
         self.now, self.life = now, 0
-        self._events: list[Event] = []
+        self._events: list[Due] = []
         self._order = 0
 
     def add(self, delay: float, steps: Steps, life: int, owner: str) -> None:
         """Have `steps` continue after `delay` s."""
         self._order += 1
-        heapq.heappush(self._events, Event(self.now + delay, self._order, steps, life, owner))
+        heapq.heappush(self._events, Due(self.now + delay, self._order, steps, life, owner))
 
     def next_time(self) -> float:
         """When the next event is due, device s; inf if none."""
         return self._events[0].at if self._events else math.inf
 
-    def due(self, t: float) -> Iterator[Event]:
+    def due(self, t: float) -> Iterator[Due]:
         """Every event up to device time `t`, in order; those of earlier processes are dropped."""
         while self._events and self._events[0].at <= t:
             event = heapq.heappop(self._events)

@@ -17,7 +17,7 @@ from conf.schema import build, check, part, setting
 from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
-from hardware.emulator.computer import HARDWARE, AppError, BusStuck, Computer, Event, ProcessDied, Steps
+from hardware.emulator.computer import HARDWARE, AppError, BusStuck, Computer, Due, ProcessDied, Steps
 from hardware.emulator.routes import Exchange
 from hardware.emulator.software import ReactorApp
 from hardware.emulator.supervisor import REQUEST, Supervisor
@@ -117,7 +117,7 @@ class ChiBioDevice:
         for event in self._events.due(t):
             self._resume(event)
 
-    def _resume(self, event: Event) -> None:
+    def _resume(self, event: Due) -> None:
         events, computer = self._events, self.computer
         try:
             pause = next(event.steps)

@@ -8,7 +8,7 @@ from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.optics import Optics
 from hardware.emulator.outputs import BUS_S, PERIOD_FACTOR, Outputs, Position
 from hardware.emulator.sysdata import SysData, append_records, clear_terminal, thin_records
-from hardware.emulator.vial import Sample
+from hardware.emulator.vial import StoredSample
 
 __all__ = ["Experiment"]
 
@@ -137,7 +137,7 @@ class Experiment:
             now, vial = self._position.computer.now(), self._position.vial
             vial.sync(now)
             culture_od = float(vial.plant.culture.od[0])
-            vial.samples.append(Sample(now, started, float(data["OD"]["current"]), culture_od))
+            vial.samples.append(StoredSample(now, started, float(data["OD"]["current"]), culture_od))
         thin_records(data)
         faults = self._position.computer.faults
         faults.bus_stuck = faults.bus_stuck or faults.disk_full  # a row is written under the bus lock

@@ -14,7 +14,7 @@ from conf.schema import check, require, setting
 from envs.plant.plant import Plant
 from envs.plant.sensor import density
 
-__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Sample", "Spectrometer", "Vial", "VialConfig", "VialFaults"]
+__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Spectrometer", "StoredSample", "Vial", "VialConfig", "VialFaults"]
 
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
@@ -40,7 +40,7 @@ class Dose(NamedTuple):
     feed_ml: float
 
 
-class Sample(NamedTuple):
+class StoredSample(NamedTuple):
     """One record of the experiment: when it became readable, the cycle's time and OD as recorded, the culture's OD."""
 
     stored_s: float
@@ -179,7 +179,7 @@ class Vial:
         self._rng, self._at = rng, start
         self.spectrometer = Spectrometer(config, self.faults, rng)
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
-        self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
+        self.samples: deque[StoredSample] = deque(maxlen=DOSES_KEPT)
         self.reads: deque[float] = deque(maxlen=READS_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
         self.supplied_ml = dict.fromkeys(SPARE, 0.0)

@@ -25,7 +25,7 @@ from hardware.safety.fluorescence import Light
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
-__all__ = ["Interlock", "Verdict", "kinds_of"]
+__all__ = ["Interlock", "Ruling", "kinds_of"]
 
 SAID = memory.Words(
     "saved interlock: {value}, expected its fields", "saved interlock: {key} = {value}: expected {what}",
@@ -35,7 +35,7 @@ SAID = memory.Words(
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Ruling:
     """What may be done now.
 
     rate: allowed feed rate, mL/s, shape (N,); 0 for every row that is not fresh or is held.
@@ -88,7 +88,7 @@ class Interlock:
 
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
-    ) -> Verdict:
+    ) -> Ruling:
         """Judge the newest samples and the proposed feed rates.
 
         Args:
@@ -179,7 +179,7 @@ class Interlock:
                 wait = (self._hold_until_s[i] - now) / 60.0
                 found[i].append(_Reason(kind, Response.HOLD, f"no dose for another {wait:.1f} min after this"))
 
-    def _conclude(self, found: list[list[_Reason]], allowed: Array, setpoint: Array) -> Verdict:
+    def _conclude(self, found: list[list[_Reason]], allowed: Array, setpoint: Array) -> Ruling:
         """Choose the most severe response per reactor, never below what is latched."""
         response = np.array(
             [max((reason.response for reason in reasons), default=0) for reasons in found], dtype=np.int64
@@ -195,7 +195,7 @@ class Interlock:
         kinds = tuple(tuple(reason.kind for reason in reasons) for reasons in found)
         rate = np.where(response == Response.PASS, allowed, 0.0)
         self.budget.grant(rate)
-        return Verdict(rate, response, lines, kinds, self._heat.off, setpoint)
+        return Ruling(rate, response, lines, kinds, self._heat.off, setpoint)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
         """Book what was dosed; without a waste pump in the model the level stays at its tube.

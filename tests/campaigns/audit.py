@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial import Dose, StoredSample
 from tests.campaigns.rehearsal import Rehearsal
 
 __all__ = ["Served", "audit_doses", "audit_rows", "fed_by", "rows_per_sample"]
@@ -33,7 +33,7 @@ def _numbers() -> "array[float]":
 class Served:
     """What one emulated reactor recorded, and when clients read its newest record. Times: device s.
 
-    stored_s, od, culture_od: of every sample, as `Sample`. read_s: of every read.
+    stored_s, od, culture_od: of every sample, as `StoredSample`. read_s: of every read.
     """
 
     stored_s: "array[float]" = field(default_factory=_numbers)
@@ -41,7 +41,7 @@ class Served:
     culture_od: "array[float]" = field(default_factory=_numbers)
     read_s: "array[float]" = field(default_factory=_numbers)
 
-    def add(self, samples: Iterable[Sample], read_s: Iterable[float]) -> "Served":
+    def add(self, samples: Iterable[StoredSample], read_s: Iterable[float]) -> "Served":
         """Take in more of both; returns itself."""
         for sample in samples:
             self.stored_s.append(sample.stored_s)

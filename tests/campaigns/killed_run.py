@@ -18,7 +18,7 @@ from conf.presets import groups
 from conf.schema import check, require, setting
 from experiments.laws.registry import on_device
 from hardware.emulator.process import EmulatorProcess
-from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial import Dose, StoredSample
 from hardware.storage.journal import read_journal
 from tests.campaigns.audit import Served, audit_doses, fed_by, rows_per_sample
 from tests.campaigns.client import Client
@@ -294,7 +294,7 @@ class Comparison:
         f = self.findings
         with open(self.folder / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as file:
             rows = [(float(row["time_min"]) * 60.0 + self._zero, float(row["od"])) for row in csv.DictReader(file)]
-        samples = [Sample(**sample) for sample in self._ask(f"samples/{name}")]
+        samples = [StoredSample(**sample) for sample in self._ask(f"samples/{name}")]
         served = Served().add(samples, self._ask(f"reads/{name}"))
         early, late = (real * self.config.speed for real in (self._clocks_s, self.config.answer_s))
         count, strangers = rows_per_sample([at for at, _ in rows], [od for _, od in rows], served, early, late)

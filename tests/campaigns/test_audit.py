@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from envs.scenario import Scenario
-from hardware.emulator.vial import Sample
+from hardware.emulator.vial import StoredSample
 from tests.campaigns.audit import Served, audit_rows, rows_per_sample
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 
@@ -81,7 +81,7 @@ def test_the_last_rows_of_a_finished_schedule_are_owed_too(r: Rehearsal) -> None
 
 
 def test_rows_are_given_to_samples_by_the_read_before_them() -> None:
-    samples = [Sample(at, at - 13.0, od, od) for at, od in ((60.0, 0.5), (120.0, 0.51), (180.0, 0.51))]
+    samples = [StoredSample(at, at - 13.0, od, od) for at, od in ((60.0, 0.5), (120.0, 0.51), (180.0, 0.51))]
     served = Served().add(samples, [59.0, 61.0, 70.0, 119.0, 122.0, 190.0])
 
     def audit(*rows: tuple[float, float]) -> tuple[list[int], int]:

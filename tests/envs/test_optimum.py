@@ -7,7 +7,7 @@ import pytest
 
 from envs.optimum import solve, solve_episode
 from envs.task import EnvConfig, step_factors
-from experiments.training.density import Density
+from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluation
 from experiments.training.session import merit
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.numeric
 @pytest.fixture(scope="module")
 def evaluation():
     config = EnvConfig()
-    return Evaluation(Density(config), Density(config).report_grid())
+    return Evaluation(DensityTask(config), DensityTask(config).report_grid())
 
 
 def test_cost_and_steady_error_of_the_nominal_task(evaluation):
@@ -70,7 +70,7 @@ def tables(rng, actions):
 def test_nothing_beats_the_optimum(model):
     """Also of a culture that outgrows the pump (the last four); 0.002 % is left since V is linear in each cell."""
     config = EnvConfig(**model, setpoints=(0.2, 0.6, 1.0))
-    score, rng = Evaluation(Density(config), Density(config).report_grid()), np.random.default_rng(0)
+    score, rng = Evaluation(DensityTask(config), DensityTask(config).report_grid()), np.random.default_rng(0)
     factors, endless = step_factors(config), solve(config, grid=3001)
     rivals = {
         "one step ahead": aiming(factors),
@@ -106,13 +106,13 @@ def test_an_offset_at_one_setpoint_shows(evaluation):
     assert score.steady_by_setpoint[0, 0] == pytest.approx(0.012, abs=0.001)
     assert score.steady_by_setpoint[0, 1:].max() < 0.002
     assert score.steady_abs_error[0] == score.steady_by_setpoint[0, 0]
-    assert merit(score, Density(EnvConfig()))[0] == pytest.approx(0.012 / 0.003, rel=0.1)
+    assert merit(score, DensityTask(EnvConfig()))[0] == pytest.approx(0.012 / 0.003, rel=0.1)
 
 
 def test_starts_too_far_for_a_slow_pump_do_not_count_as_offsets():
     """At tau = 0.6 the culture thins by 0.3 % a minute: from 1.1 the setpoint 0.2 is eight hours away."""
     config = EnvConfig(tau=0.6)
-    evaluation = Evaluation(Density(config), Density(config).report_grid())
+    evaluation = Evaluation(DensityTask(config), DensityTask(config).report_grid())
     assert evaluation.optimum_steady < 0.001
     exact = evaluation(of(aiming(step_factors(config))))
     assert exact.steady_abs_error[0] < 0.001

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from envs.coculture.task import logit, share
-from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
 from tests.two_species import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 
 
@@ -48,8 +48,8 @@ class Reckoning:
     def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
         """It forgets nothing."""
 
-    def estimate(self) -> Estimate:
-        return Estimate(
+    def estimate(self) -> ShareEstimate:
+        return ShareEstimate(
             self._x,
             np.zeros(self._x.size),
             np.full(self._x.size, EQUAL_RATES_C),
@@ -57,7 +57,7 @@ class Reckoning:
             *np.zeros((3, self._x.size)),
         )
 
-    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         with np.errstate(invalid="ignore"):
             return np.clip(EQUAL_RATES_C - 20.0 * (logit(wanted.setpoint) - self._x), T_MIN, T_MAX)
 

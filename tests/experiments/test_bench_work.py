@@ -15,7 +15,7 @@ import pytest
 
 from experiments import blank as blanks
 from experiments.blank import BlankConfig, blank
-from experiments.calibrate_pump import CalibratePumpConfig, Series, _number, calibrate, report, weigh
+from experiments.calibrate_pump import CalibratePumpConfig, Weighing, _number, calibrate, report, weigh
 from experiments.cli import frame
 from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
@@ -112,9 +112,9 @@ def test_a_file_of_nonsense_ends_in_one_line(tmp_path: Path, content: str, words
 
 
 def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
-    series = [Series(duty, 20, 20 * 0.9 * (PERIOD_S * duty + 0.1)) for duty in (0.01, 0.02, 0.04)]
+    series = [Weighing(duty, 20, 20 * 0.9 * (PERIOD_S * duty + 0.1)) for duty in (0.01, 0.02, 0.04)]
 
-    def said(found: list[Series]) -> str:
+    def said(found: list[Weighing]) -> str:
         on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).T
         return report(fit_pump(on_s, doses, grams), found)
 
@@ -127,7 +127,7 @@ def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
 
 def test_each_weighing_stands_beside_what_is_fitted_in_ml_of_one_of_its_doses() -> None:
     """0.8 mL/s of what a pump runs beyond 0.1 s less than asked; 20, 8 and 5 doses were weighed."""
-    found = [Series(duty, n, n * 0.8 * (PERIOD_S * duty - 0.1)) for duty, n in ((0.01, 20), (0.02, 8), (0.05, 5))]
+    found = [Weighing(duty, n, n * 0.8 * (PERIOD_S * duty - 0.1)) for duty, n in ((0.01, 20), (0.02, 8), (0.05, 5))]
     on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).T
     head, *lines = report(fit_pump(on_s, doses, grams), found).splitlines()
     assert head.split() == ["asked", "s", "doses", "mL/dose", "fitted"]

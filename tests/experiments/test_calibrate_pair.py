@@ -275,7 +275,7 @@ def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(
 ) -> None:
     """0.06 T - 1.1 and -0.01 T^2 + 0.6 T - 8.1: at 27 degC 0.52 and 0.81 1/h, at 35 degC 1.0 and 0.65."""
     points = [[at(27.0, 0.52), at(35.0, 1.0, 0.02)], [at(28.0, 0.86, 0.03, 4100.0)]]
-    found = [curves.Curve((1.0,), np.array([0.25, -1.5])), curves.Curve((1.0,), np.array([2.0]))]
+    found = [curves.Polynomial((1.0,), np.array([0.25, -1.5])), curves.Polynomial((1.0,), np.array([2.0]))]
     told = {"first": 0.021, "first_sd": 0.004, "second": -0.104, "second_sd": 0.012, "even_c_alone": 32.126}
     _say(CalibratePairConfig(names=("alpha", "beta")), TRUE, points, found, told, tmp_path)
     lines = capsys.readouterr().out.splitlines()

@@ -22,14 +22,14 @@ from experiments import deploy
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig, Limits
-from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate, Check, certify, recheck, worst
+from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate, Requirement, certify, recheck, worst
 from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import attacked
 from experiments.cli import files
 from experiments.cli.frame import UserError
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
-from experiments.control.policies import SHIPPED, Wanted, admit, find_policy, policy_check
+from experiments.control.policies import SHIPPED, WantedPolicy, admit, find_policy, policy_check
 from experiments.laws.density import estimator as filters
 from experiments.laws.density import learned
 from experiments.laws.density.estimator import EstimatorConfig
@@ -80,7 +80,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "elsewhere on both sides": ({"given": laws.law(), "setpoints": [0.5, 0.6]}, r"0.5 to 0.6, .* asks for 0.45, 0.65 "),
     "damaged": ({"given": laws.law(), "setpoints": None}, r"certificate.json is damaged \(TypeError"),
     "of an unknown kind": (
-        {"given": laws.law(), "checks": [{**asdict(Check("a", 2.0, 1.0, kind="taste")), "holds": False}]}, "kind taste",
+        {"given": laws.law(), "checks": [asdict(Requirement("a", 2.0, 1.0, kind="taste")) | {"holds": False}]},
+        "kind taste",
     ),
     "of an older format": ({"given": laws.law(), "format": certificate.FORMAT - 1}, r"this version reads format "),
     "of a newer format": ({"given": laws.law(), "format": certificate.FORMAT + 1}, r"this version reads format "),
@@ -160,7 +161,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
     In 28 mL and growing by 0.0432 1/min it needs more than the pump has.
     """
     source = written(tmp_path / "policy.npz", laws.law())
-    wanted = Wanted(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, 10.0, at_stake=True, forced=False)
+    wanted = WantedPolicy(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, 10.0, at_stake=True, forced=False)
     check = policy_check(wanted)
     assert (check.ok, "performance" in check.detail) == (True, False)
     unpacked(source, tmp_path / "run")
@@ -186,8 +187,8 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
 
 def test_the_worst_of_each_requirement_is_told() -> None:
     """Farthest beyond its limit, relative to it; what could not be proven is worst."""
-    wide, wider, none = Check("a: w", 3.0, 2.0), Check("b: w", 1.6, 1.0), Check("c: w", np.nan, 9.0)
-    late = Check("a: late", 1.0, 0.5)
+    wide, wider, none = Requirement("a: w", 3.0, 2.0), Requirement("b: w", 1.6, 1.0), Requirement("c: w", np.nan, 9.0)
+    late = Requirement("a: late", 1.0, 0.5)
     assert worst([wide, late, wider]) == [wider, late]
     assert worst([wide, none, wider]) == [none]
 
@@ -309,7 +310,7 @@ def test_bounds_of_a_certificate_that_is_not_safe_let_nobody_act(relative: Path,
     """Where its policy flies all the same, surprises alone supervise it. Performance takes no bounds away."""
     content = json.loads(certificate.beside(relative).read_text())
     source = beside(relative, policy.load(relative), tmp_path)
-    failed = [{**asdict(Check("a: b", 3.0, 1.0, kind=kind)), "holds": False} for kind in (SAFETY, PERFORMANCE)]
+    failed = [{**asdict(Requirement("a: b", 3.0, 1.0, kind=kind)), "holds": False} for kind in (SAFETY, PERFORMANCE)]
     for failure, bounded in (
         ({}, True), ({"safe": False}, False), ({"checks": failed[:1]}, False), ({"checks": failed[1:]}, True),
         ({"passed": False}, True),
@@ -384,7 +385,7 @@ def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(
     """
     given, bench = policy.load(relative), Bench(period_s=300.0, max_rate=0.05)
     model = EnvConfig(tau=bench.tau, control_min=5.0, max_pump_rate=0.05)
-    admit(given, relative, Wanted("name", bench, model, {}, SCENARIO.setpoints, 10.0, True, False), resumed=False)
+    admit(given, relative, WantedPolicy("name", bench, model, {}, SCENARIO.setpoints, 10.0, True, False), resumed=False)
     bounds = certificate.bounds(given, settings(given), relative, model)
     assert bounds is not None
     assert bounds.full_pump == pytest.approx(0.75)
@@ -559,13 +560,13 @@ def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run
 
 def test_what_is_told_of_a_certificate_is_what_fails_and_what_comes_closest() -> None:
     checks = (
-        Check("polygons", 0.0, 0.0),
-        Check("nominal: entry", 0.4, 1.0),
-        Check("noise: entry", 0.9, 1.0, "setpoint 0.4"),
-        Check("uncertain: entry", 0.7, 1.0),
-        Check("nominal: half-width", 0.5, 0.1, kind=PERFORMANCE),
-        Check("noise: half-width", float("nan"), 2.0),
-        Check("uncertain: half-width", 0.3, 2.0),
+        Requirement("polygons", 0.0, 0.0),
+        Requirement("nominal: entry", 0.4, 1.0),
+        Requirement("noise: entry", 0.9, 1.0, "setpoint 0.4"),
+        Requirement("uncertain: entry", 0.7, 1.0),
+        Requirement("nominal: half-width", 0.5, 0.1, kind=PERFORMANCE),
+        Requirement("noise: half-width", float("nan"), 2.0),
+        Requirement("uncertain: half-width", 0.3, 2.0),
     )
     found = Certificate(None, (), checks, (), np.zeros(0), [], None, False)  # type: ignore[arg-type]
     assert found.told() == [

@@ -16,7 +16,7 @@ from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
 from experiments.reporting import charts
 from experiments.reporting.page import Page
-from experiments.reporting.tables import Best
+from experiments.reporting.tables import Emphasis
 
 FLOOR_RED = "#b00020"
 STEPS = (
@@ -282,7 +282,7 @@ def test_the_paper_s_table_marks_the_lowest_of_the_three_on_either_side_and_no_o
     ]
     table = page.table_2(rows, "ise")
     assert table.columns[4:8] == ("dqn, here", "pi, here", "mpc, here", "oracle, here")
-    assert [[head for head, cell in zip(table.columns, row, strict=True) if isinstance(cell, Best)]
+    assert [[head for head, cell in zip(table.columns, row, strict=True) if isinstance(cell, Emphasis)]
             for row in table.rows] == [["mpc, published", "pi, here"], ["dqn, published", "dqn, here"]]  # fmt: skip
     assert [row[-2:] for row in table.rows] == [("mpc", "pi"), ("dqn", "dqn")]
     assert "n = 5" in table.note

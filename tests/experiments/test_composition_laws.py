@@ -12,7 +12,7 @@ from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
 from experiments.laws import registry
 from experiments.laws.registry import SHARE
 from experiments.laws.share import planned
-from experiments.laws.share.base import Estimate, Wanted
+from experiments.laws.share.base import ShareEstimate, Wanted
 from experiments.laws.share.program import Program
 from hardware import memory
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
@@ -33,7 +33,7 @@ def seen(x, temperature=33.2, rate=None):
     x = np.atleast_1d(np.asarray(x, dtype=float))
     warm = np.broadcast_to(float(temperature), x.shape)
     lagged = p_putida_rate(warm) if rate is None else np.full(x.shape, rate)
-    return Estimate(x, np.full(x.shape, 0.1), warm, lagged, *np.zeros((3, x.size)))
+    return ShareEstimate(x, np.full(x.shape, 0.1), warm, lagged, *np.zeros((3, x.size)))
 
 
 def asked(s, following=None, minutes=0.0, n=1):
@@ -52,7 +52,7 @@ def on_the_model(kind, program, announce_min=360.0, start=0.5, policy=None, **va
     state, shares = at_rest(config, logit(np.array([start]))), [start]
     for minute in range(int(program.total_min)):
         wanted = program.wanted(np.array([float(minute)]), announce_min)
-        known = Estimate(state[:, 0], np.zeros(1), state[:, 1], state[:, 2], *np.zeros((3, 1)))
+        known = ShareEstimate(state[:, 0], np.zeros(1), state[:, 1], state[:, 2], *np.zeros((3, 1)))
         target = controller.act(known, wanted, np.array([float(minute)]), np.isfinite(wanted.setpoint))
         state = advance(config, state, np.where(np.isfinite(wanted.setpoint), target, 33.2), 1.0)
         shares.append(float(share(state[0, 0])))

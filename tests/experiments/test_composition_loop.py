@@ -12,12 +12,12 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.laws import registry
-from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
 from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.share import COLUMNS, Share, ShareWarnings
 from experiments.loop.signals import Sample, Signal
-from experiments.record.record import Table
+from experiments.record.record import Recordings
 from experiments.record.summary import composition_figure_of, figure_of
 from hardware.actuator import THERMOSTAT
 from hardware.emulator.device import plant_preset
@@ -44,7 +44,7 @@ class Scripted(Reckoning):
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         self.seen.append((od, fluorescence, temperature, minute, rows))
 
-    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         self.asked = wanted, minute, rows
         return np.full(minute.shape, self.answer)
 
@@ -433,7 +433,9 @@ def test_a_change_is_announced_in_the_figure_once_its_time_has_come_and_a_recove
     ]
     first, second = [110.0 / 60.0, 0.7], [65.0 / 60.0, 0.5]
     for rows, told in ((41, [[], [second]]), (minutes.size, [[first], [second]])):  # to minute 80, and all
-        table = Table(("M0", "M1"), {key: values[:, :rows] for key, values in columns.items()}, [[], []], [], marks)
+        table = Recordings(
+            ("M0", "M1"), {key: values[:, :rows] for key, values in columns.items()}, [[], []], [], marks
+        )
         share, _, density, *_ = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
         assert [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"] == told
     for ax in (density, figure_of(table, scenarios, "").axes[0]):

@@ -17,7 +17,7 @@ from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from hardware.reactor import Command, Measurement, Receipt
 from hardware.safety.config import Response, SafetyConfig
-from hardware.safety.interlock import Interlock, Verdict
+from hardware.safety.interlock import Interlock, Ruling
 from tests.hardware.driver_lab import DriverLab, Law
 
 QUIET = DeviceOptions(vial=VialConfig(outlier_rate=0.0))
@@ -290,7 +290,7 @@ def test_what_the_interlock_demands_is_done_to_its_own_reactor_and_what_failed_i
     def asked(*codes: Response, left: np.ndarray = none) -> list[str]:
         done.clear()
         lines, setpoint = [None] * n, np.array([0.3, 0.6])
-        return loop._respond(Verdict(np.zeros(n), np.array(codes), lines, ((), ()), none, setpoint), left)
+        return loop._respond(Ruling(np.zeros(n), np.array(codes), lines, ((), ()), none, setpoint), left)
 
     assert asked(Response.PUMPS_OFF, Response.REGULATE) == ["M0: pumps_off"]
     assert done == [("pumps_off", [True, False]), ([False, True], [0.3, 0.6])]

@@ -268,7 +268,7 @@ def test_reactors_around_which_no_loop_can_be_closed_are_stopped(tmp_path, monke
 def test_a_timetable_names_the_last_folder_that_was_given(monkeypatch, capsys):
     monkeypatch.setattr(timetable, "timetable", lambda config, place, now: f"{config.controller.kind} in {place}")
     config = DeployConfig(controller=registry.config("pi"), dry_run=True)
-    monkeypatch.setattr(frame.Command, "config", lambda self, words: config)
+    monkeypatch.setattr(frame.EntryPoint, "config", lambda self, words: config)
     words = ["dry_run=true", "controller=pi"]
     command._answer([*words, "hydra.run.dir=a", "hydra.run.dir=b c"])
     command._answer(words)
@@ -363,7 +363,7 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
         return found
 
     monkeypatch.setattr(policy, "load", read_while_a_training_ends)
-    wanted = policies.Wanted("latest", Bench(), EnvConfig(), {}, (), 10.0, at_stake=False, forced=False)
+    wanted = policies.WantedPolicy("latest", Bench(), EnvConfig(), {}, (), 10.0, at_stake=False, forced=False)
     flown = policies.run_policy(wanted, tmp_path, resumed=False)
     monkeypatch.setattr(policy, "load", read)
     assert policies.find_policy("latest") == Path("runs/train/new/policy.npz")

@@ -33,7 +33,7 @@ from experiments.certification.figure import figure as certificate_figure
 from experiments.certification.judge import Certificate, certify
 from experiments.comparison import figures
 from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
-from experiments.record.record import Table
+from experiments.record.record import Recordings
 from experiments.record.summary import composition_figure_of, figure_of
 from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
 from experiments.reporting.calibration_charts import agreement_figure
@@ -95,7 +95,7 @@ def read(ax: Axes, what: str) -> tuple[Any, Any]:
     return np.asarray(x, float), np.array([y, *np.array([s[:, 1] for s in ends]).T], float)
 
 
-def table() -> Table:
+def table() -> Recordings:
     """Two reactors, of which the second has twice of everything, is seen 5 min later, and once is not believed.
 
     At the bench somebody looked at M1 in minute 45, and counted a sample of each.
@@ -111,7 +111,7 @@ def table() -> Table:
     both |= {"time_min": np.stack([MINUTES, LATER]), "elapsed_min": np.stack([MINUTES] * 2)}
     both["believed"][1, 3] = 0.0
     marks = [Mark(45.0, "M1", "looked"), Mark(60.0, "M0", "", None, 0.3, 0.02), Mark(120.0, "M1", "", None, 0.6, 0.05)]
-    return Table(("M0", "M1"), both, [[], []], [], marks)
+    return Recordings(("M0", "M1"), both, [[], []], [], marks)
 
 
 SCENARIO = Scenario((0.45, 0.45), (180.0, 150.0), (37.0, 30.0), ratios=(0.4, 0.4))

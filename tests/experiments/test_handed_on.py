@@ -182,7 +182,7 @@ def test_what_a_run_leaves_is_named_with_the_command_that_goes_on(tmp_path: Path
     folder = tmp_path / "my run"
     for name in ("config.yaml", "deploy.log", "events.out.1", "x.csv.part", ".hydra", "reactors"):
         (folder / name).mkdir(parents=True)
-    command = frame.Command("deploy", None, lambda config, folder: None, resumes="state.json")
+    command = frame.EntryPoint("deploy", None, lambda config, folder: None, resumes="state.json")
     assert command._left(folder) == f"{folder} keeps no result; to try again, start anew"
     (folder / "journal.jsonl").touch()
     (folder / "recordings").mkdir()

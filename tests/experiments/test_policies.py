@@ -206,7 +206,7 @@ def test_a_look_at_a_policy_says_what_is_wrong_with_it_and_whether_a_run_would_b
     monkeypatch.chdir(tmp_path)
     given = laws.law()
     policy.save(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, "regret_pct": 127.0}))
-    asked = policies.Wanted(name, Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=False, forced=False)
+    asked = policies.WantedPolicy(name, Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=False, forced=False)
     found = policies.policy_check(replace(asked, **changes))
     assert (found.name, found.remedy, found.required) == ("policy", remedy, required)
     assert said in found.detail
@@ -219,7 +219,7 @@ def test_a_look_at_a_policy_that_only_lacks_performance_passes_and_says_so(at_st
     source = written(
         tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, "regret_pct": 127.0})
     )
-    asked = policies.Wanted(str(source), Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=at_stake, forced=False)
+    asked = policies.WantedPolicy(str(source), Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=at_stake, forced=False)
     found = policies.policy_check(asked)
     assert found.ok
     assert "its regret is 127 %, more than poor_regret_pct = 10 %" in found.detail

@@ -18,7 +18,7 @@ from experiments.loop.loop import Step
 from experiments.loop.progress import Progress
 from experiments.record import summary
 from experiments.record.curves import Curves, _results, _table
-from experiments.record.record import Record, Table
+from experiments.record.record import Record, Recordings
 from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, load_state
 from experiments.reporting import charts
 from hardware.errors import RecordingError
@@ -120,7 +120,7 @@ def recorded(minutes: list[float], words: dict[float, str], **cells: float) -> R
     return found
 
 
-def two_reactors() -> Table:
+def two_reactors() -> Recordings:
     """M0 stays 0.02 above its 0.5 for 4 min; M1 at 0.7 begins 10 min later and is not over."""
     words = {1.0: "budget: none left | stale: as before", 3.0: "stale: as before"}
     rows = [recorded([0.0, 1.0, 2.0, 3.0, 4.0], words, od=0.52, volume_ml=0.5, setpoint=0.5)]
@@ -128,7 +128,7 @@ def two_reactors() -> Table:
     columns = {
         key: np.array([[*own.columns[key], *[np.nan] * (5 - len(own))] for own in rows]) for key in rows[0].columns
     }
-    return Table(("M0", "M1"), columns, rows, ["mended"], [Mark(2.0, "M1", "looked")])
+    return Recordings(("M0", "M1"), columns, rows, ["mended"], [Mark(2.0, "M1", "looked")])
 
 
 SCHEDULES = Scenario((0.5,), (4.0,), (37.0,)), Scenario((0.8, 0.6), (1.0, 3.0), (33.0, 30.0))

@@ -25,7 +25,7 @@ from experiments.comparison import page as comparison
 from experiments.comparison.run import benchmark as run_benchmark
 from experiments.reporting import charts
 from experiments.reporting.page import Page
-from experiments.reporting.tables import Best, Table, count, number, plus_minus, typeset
+from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus, typeset
 from tests.experiments.test_deploy import inverse_policy
 from tests.patience import PATIENCE_S
 
@@ -124,8 +124,10 @@ RANKED = ("ise_mean", "itae_mean", "itae_median", "clean_ise", "clean_itae", "cl
 def marked(page: Page, name: str) -> list[str]:
     """The laws that stand out in a table, whichever way round it is."""
     (table,) = (table for table in page.tables if table.name == name)
-    across = [law for row in table.rows for law, cell in zip(table.columns, row, strict=True) if isinstance(cell, Best)]
-    return across if table.columns[0] == "plant" else [row[0] for row in table.rows if isinstance(row[1], Best)]
+    across = [
+        law for row in table.rows for law, cell in zip(table.columns, row, strict=True) if isinstance(cell, Emphasis)
+    ]
+    return across if table.columns[0] == "plant" else [row[0] for row in table.rows if isinstance(row[1], Emphasis)]
 
 
 def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
@@ -256,7 +258,7 @@ def test_a_page_escapes_what_it_is_given():
 
 
 def test_a_table_escapes_what_each_format_reads_as_its_own():
-    table = Table("t", "50 % & more_", ("a", "b"), (("x<y", Best("1,5")),))
+    table = Table("t", "50 % & more_", ("a", "b"), (("x<y", Emphasis("1,5")),))
     built = one_section()
     built.table(table)
     assert "<th>x&lt;y</th>" in built.html()
@@ -426,7 +428,7 @@ def test_each_run_of_a_folder_has_its_own_seed_command_and_figures(tmp_path):
 
 
 def test_a_table_for_a_paper_has_its_units_in_symbols():
-    table = Table("t", "37 °C, 10⁻³ OD² min", ("law", "µL/s"), (("a~b", Best("−1 ± 2")), ("{c}", "–")))
+    table = Table("t", "37 °C, 10⁻³ OD² min", ("law", "µL/s"), (("a~b", Emphasis("−1 ± 2")), ("{c}", "–")))
     assert table.latex().splitlines() == [
         r"\begin{table}", r"\caption{37 $^\circ$C, 10$^-$$^3$ OD$^2$ min}\label{tab:t}", r"\begin{tabular}{lr}",
         r"\toprule", r"law & $\mu$L/s \\", r"\midrule", r"a\textasciitilde{}b & \textbf{$-$1 $\pm$ 2} \\",

@@ -157,7 +157,7 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
 
 def test_what_a_finished_job_found_stands_when_it_is_asked_for_something_else(tmp_path):
     ran = []
-    calm = frame.Command("train", TrainConfig(), lambda config, folder: ran.append(config.seed) or 0.0)
+    calm = frame.EntryPoint("train", TrainConfig(), lambda config, folder: ran.append(config.seed) or 0.0)
     for seed in (1, 2):
         calm._once(frame.compose("train", [f"seed={seed}"]), tmp_path, sweep.Job.at(tmp_path))
     assert calm._once(frame.compose("train", ["seed=1"]), tmp_path, sweep.Job.at(tmp_path)) == 0.0
@@ -171,7 +171,7 @@ def test_what_a_finished_job_found_stands_when_it_is_asked_for_something_else(tm
     ids=["a training", "a deployment"],
 )
 def test_of_a_job_that_was_stopped_twice_each_life_is_kept_or_gone_on_with(
-    entry: frame.Command[Any], saved: str, goes_on: bool, tmp_path: Path
+    entry: frame.EntryPoint[Any], saved: str, goes_on: bool, tmp_path: Path
 ) -> None:
     """A training goes on from what it saved, to the same result. A deployment begins anew, on vials that are new: what
     its earlier lives left lies aside, in a folder each."""

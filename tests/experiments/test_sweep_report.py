@@ -13,7 +13,7 @@ from experiments import report
 from experiments.cli import frame, sweep
 from experiments.reporting import sweep_page, sweep_results
 from experiments.reporting.page import Page
-from experiments.reporting.tables import Best
+from experiments.reporting.tables import Emphasis
 
 
 def job(folder: Path, overrides: list[str], state: str = "finished", error: str = "", **summary: Any) -> None:
@@ -130,7 +130,7 @@ def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_numb
         ("#1", "b", "5", "1", "1.67", "4"), ("#2", "a", "1", "5", "5", "5"), ("#3", "c", "–", "–", "–", "–"),
     ]  # fmt: skip
     assert [row[5] for row in each.rows[1:]] == ["–", "–"]
-    assert [[isinstance(cell, Best) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
+    assert [[isinstance(cell, Emphasis) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
 
 
 def test_figures_have_the_best_eight_and_the_values_of_their_own_measure(

@@ -27,7 +27,7 @@ from experiments.train import main as entry_point
 from experiments.training import build
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
-from experiments.training.density import Density, first_actions
+from experiments.training.density import DensityTask, first_actions
 from tests.patience import PATIENCE_S
 
 SHORT = [
@@ -121,8 +121,8 @@ def test_the_optimums_map_is_that_of_each_setpoint_solved_alone():
 
 def test_selection_and_report_share_no_start():
     config = EnvConfig()
-    kept = {(round(a, 9), round(b, 9)) for a, b in Density(config).selection_grid()}
-    reported = {(round(a, 9), round(b, 9)) for a, b in Density(config).report_grid()}
+    kept = {(round(a, 9), round(b, 9)) for a, b in DensityTask(config).selection_grid()}
+    reported = {(round(a, 9), round(b, 9)) for a, b in DensityTask(config).report_grid()}
     assert len(reported) == 41 * 9
     assert not kept & reported
 
@@ -130,7 +130,7 @@ def test_selection_and_report_share_no_start():
 def test_what_is_remembered_follows_the_model_also_at_the_end_of_an_episode():
     """x' = f(u) x towards the same setpoint in every transition of six episodes, and nothing is final."""
     env = EnvConfig(episode_steps=5)
-    trainer = build.trainer(Density(env), TrainConfig().agent, range(3))
+    trainer = build.trainer(DensityTask(env), TrainConfig().agent, range(3))
     trainer._observation, _ = trainer.env.reset()
     for _ in range(30):
         trainer._step()

@@ -31,10 +31,10 @@ from experiments.training import announcements, build, tasks
 from experiments.training import run as train_run
 from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
-from experiments.training.density import Density
+from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluation, Rollout, Score, each
 from experiments.training.relative import Relative
-from experiments.training.session import Best, Session, merit
+from experiments.training.session import BestSoFar, Session, merit
 from tests.experiments.test_deploy import inverse_policy
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
@@ -70,7 +70,7 @@ def test_only_a_policy_that_was_trained_to_the_end_and_is_good_is_sent_to_a_proo
 ) -> None:  # fmt: skip
     score = scored(regret, steady)
     with caplog.at_level("INFO"):
-        announcements.ended(tmp_path, Density(EnvConfig()), score, score, "", tmp_path / "policy.npz", whole=whole)
+        announcements.ended(tmp_path, DensityTask(EnvConfig()), score, score, "", tmp_path / "policy.npz", whole=whole)
     assert any("next, try it: python -m experiments.deploy" in line for line in caplog.messages)
     assert any("experiments.certify" in line for line in caplog.messages) == sent
 
@@ -94,7 +94,7 @@ def test_a_policy_is_scored_by_the_first_episode_that_ends_behind_each_multiple(
 
 def test_what_is_kept_is_told_of_the_policy_that_is_kept() -> None:
     """The last one has a smaller steady error, of another one the regret is smaller; neither is better."""
-    best, task = Best.empty(torch.zeros(2, 3)), Density(EnvConfig())
+    best, task = BestSoFar.empty(torch.zeros(2, 3)), DensityTask(EnvConfig())
     each = [
         scored([0.3, 9.0], [[0.002, 0.002], [0.1, 0.3]]),  # 0.67 and 100 units
         scored([5.0, 0.2], [[0.0004, 0.0001], [0.0001, 0.003]]),  # 10 and 1
@@ -300,7 +300,7 @@ def test_an_agent_of_a_population_is_the_same_seed_alone(env: str, agent: str) -
 )
 def test_the_last_line_is_about_the_worst_of_all_seeds(regret: list[float], steady: list[float], said: str) -> None:
     score = scored(regret, [[0.0, each] for each in steady])
-    assert announcements._verdict(score, Density(EnvConfig())) == said
+    assert announcements._verdict(score, DensityTask(EnvConfig())) == said
 
 
 def test_episodes_with_a_change_are_grouped_by_the_share_at_which_they_rest() -> None:
@@ -336,7 +336,7 @@ def test_a_setpoint_at_which_nothing_rests_is_scored_from_the_nearest_start() ->
     Nothing would ever be kept if one of them had no score.
     """
     env = EnvConfig(mu=0.07, setpoints=(0.2, 0.6, 1.0))
-    evaluation = Evaluation(task := Density(env), task.report_grid())
+    evaluation = Evaluation(task := DensityTask(env), task.report_grid())
     score = evaluation(task.myopic)
     assert score.steady_by_setpoint.shape == (1, 3)
     assert np.isfinite(score.steady_by_setpoint).all()
@@ -359,7 +359,7 @@ def test_progress_tells_the_time_left_what_is_scored_and_what_is_kept() -> None:
     """A quarter done in a minute: three are left. Medians over three agents."""
     score = scored([4.0, 2.0, 9.0], [[0.03], [0.01], [0.02]])
     kept = np.array([1.0, 0.5, 3.0]), np.array([0.004, 0.006, 0.009])
-    assert announcements.progress(250, 1000, 60.0, score, kept, Density(EnvConfig())) == (
+    assert announcements.progress(250, 1000, 60.0, score, kept, DensityTask(EnvConfig())) == (
         "25 %, 3:00 min left: selection grid: 4.00 % regret, 0.0200 OD steady error; "
         "kept: 1.00 % regret, 0.0060 OD steady error"
     )
@@ -474,7 +474,7 @@ def replaced(task: Any, uniform: list[list[float]], before: list[float], after: 
 
 def test_goals_in_hindsight_reach_over_the_setpoints_of_the_task_in_whatever_order_they_are() -> None:
     """0.3 to 0.7, and the reward is that of the OD reached, 0.6, not of the one before."""
-    task = Density(EnvConfig(setpoints=(0.5, 0.7, 0.3, 0.6)))
+    task = DensityTask(EnvConfig(setpoints=(0.5, 0.7, 0.3, 0.6)))
     batch = replaced(task, [[0.0, 0.5], [0.25, 0.5], [1.0, 0.5]], [0.9, 0.5], [0.6, 0.5])
     np.testing.assert_allclose(batch.s_t[0, :, 1], [0.3, 0.4, 0.7], rtol=1e-6)
     np.testing.assert_allclose(batch.r_t[0], [-0.09, -0.04, -0.01], rtol=1e-5)
@@ -503,7 +503,7 @@ def test_programs_in_hindsight_are_those_of_the_task() -> None:
 
 def test_more_agents_than_a_group_holds_are_the_seeds_that_they_are_called_by() -> None:
     """Eighteen in groups of 16 and 2."""
-    task = Density(EnvConfig())
+    task = DensityTask(EnvConfig())
     many = build.population(task, SMALL, range(5, 23), threads=3)
     assert ([group.agent.n_agents for group in many.groups], many.n_agents, many.threads) == ([16, 2], 18, 3)
     for k in (0, 15, 16, 17):
@@ -535,7 +535,7 @@ def test_a_policy_of_a_share_sees_the_edge_of_what_its_task_trains() -> None:
         "shares of two species by temperature, a decision every 20 min, the next setpoint known 60 min ahead"
     )
     assert (task.regret_unit, Coculture(CocultureConfig()).regret_unit) == (5.0, 0.5)
-    assert Density(EnvConfig(control_min=2.5)).model()["control_min"] == 2.5
+    assert DensityTask(EnvConfig(control_min=2.5)).model()["control_min"] == 2.5
 
 
 def test_grids_of_a_share_are_every_start_with_every_setpoint_at_rest() -> None:
@@ -569,7 +569,7 @@ def test_the_optimum_of_many_programs_at_once_is_that_of_each_alone(monkeypatch:
 
 def test_the_one_line_law_takes_the_rate_after_which_the_model_is_nearest_to_the_setpoint() -> None:
     """u = tau (mu + ln(x / r) / h) in sixteenths of 0.02 mL/s: 38.8, 11.2 and 6.4, by tau 0.4 and h 2 min."""
-    task = Density(EnvConfig(mu=0.03, tau=0.4, control_min=2.0))
+    task = DensityTask(EnvConfig(mu=0.03, tau=0.4, control_min=2.0))
     seen = np.array([[0.6, 0.5], [0.505, 0.5], [0.49, 0.5]])
     assert task.myopic(seen).tolist() == [16, 11, 6]
     assert task.myopic(seen[None, ::-1] * [[[1.0, 1.0]], [[2.0, 2.0]]]).tolist() == [[6, 11, 16]] * 2
@@ -595,7 +595,7 @@ def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the
 ) -> None:
     drawn = captured(monkeypatch, "policy_map", "trajectories")
     env = EnvConfig(mu=0.03, tau=0.4, control_min=2.5, episode_steps=60, setpoints=(0.2, 0.3, 0.6, 0.9))
-    Density(env).figures(still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1]))
+    DensityTask(env).figures(still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1]))
     od, setpoint, learned, best = drawn["policy_map"]
     assert (setpoint[0], setpoint[-1]) == (0.2, 0.9)
     np.testing.assert_allclose(learned, 10.0 * od + setpoint[:, None])
@@ -662,7 +662,7 @@ def test_a_policy_of_estimates_says_with_which_estimator_it_was_meant(env: Any, 
     config = TrainConfig(agent=SMALL, env=env, n_agents=2, seed=3)
     task = tasks.of(env)
     agents = build.population(task, SMALL, (3, 4))
-    best = Best.empty(agents.weights())
+    best = BestSoFar.empty(agents.weights())
     best.merit[:], best.step[:], best.updates[:] = (2.0, 1.0), (90, 60), (50, 20)
     parts = SimpleNamespace(config=config, best=best, task=task, folder=tmp_path, seeds=(3, 4), agents=agents)
     path, flies = train_run._export(parts, scored([0.3, 0.6], [[0.01, 0.02], [0.001, 0.003]]))  # type: ignore[arg-type]
@@ -715,7 +715,9 @@ def test_start_and_end_are_told_with_all_seeds_their_worst_and_the_command_that_
 
 def test_the_table_of_runs_has_of_each_seed_its_own_numbers() -> None:
     writer = Mock(agents=[Mock(), Mock()])
-    announcements.results(writer, 90, scored([0.4, 7.0], [[0.001, 0.002], [0.05, 0.01]]), Density(EnvConfig()), (8, 9))
+    announcements.results(
+        writer, 90, scored([0.4, 7.0], [[0.001, 0.002], [0.05, 0.01]]), DensityTask(EnvConfig()), (8, 9)
+    )
     told = [events.scalars.call_args.args for events in writer.agents]
     assert told == [
         ({"result/regret_pct": 0.4, "result/steady_abs_error": 0.002}, 90),

@@ -28,7 +28,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware.board import board_agent
-from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, reduce_sysdata
+from hardware.board.board_agent import BoardAgent, Device, decode_request, encode_reply, reduce_sysdata
 from hardware.link.serial import decode_header, encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Served, until
@@ -156,7 +156,7 @@ class Recorder(Device):
 @given(st.lists(st.one_of(st.binary(max_size=80), st.just(b">")), max_size=8))
 def test_nothing_is_carried_out_on_garbage(lines: list[bytes]) -> None:
     device = Recorder()
-    agent = Agent(device, 10.0)
+    agent = BoardAgent(device, 10.0)
     for line in lines:
         reply = agent.answer_line(line)
         assert reply == b"" or reply.startswith(b"<0 20 ")
@@ -166,7 +166,7 @@ def test_nothing_is_carried_out_on_garbage(lines: list[bytes]) -> None:
 
 def test_a_repeated_request_is_answered_from_memory_until_hello() -> None:
     device = Recorder()
-    agent = Agent(device, 10.0)
+    agent = BoardAgent(device, 10.0)
     line = encode_request(5, "POST", "/SetOutputOn/Pump3/2/M0")[:-1]
     assert agent.answer_line(line) == agent.answer_line(line) == encode_reply(5, 204, b"")
     assert len(device.asked) == 1
@@ -179,13 +179,13 @@ def test_a_repeated_request_is_answered_from_memory_until_hello() -> None:
     assert len(device.asked) == 4
 
 
-def ask(agent: Agent, session: int, method: str, path: str = "/", count: int = 7) -> bytes:
+def ask(agent: BoardAgent, session: int, method: str, path: str = "/", count: int = 7) -> bytes:
     return agent.answer_line(encode_request(session << 16 | count, method, path)[:-1])
 
 
 def test_a_second_client_on_the_line_is_refused_until_the_first_says_bye() -> None:
     device = Recorder()
-    agent = Agent(device, 10.0)
+    agent = BoardAgent(device, 10.0)
     assert ask(agent, 3, "HELLO").split(b" ")[1] == b"200"
     for method, path in (("POST", "/x"), ("GET", "/x"), *((verb, "/") for verb in ("HELLO", "PING", "BYE"))):
         head, _, body = ask(agent, 4, method, path).partition(b"\n")
@@ -205,7 +205,7 @@ def test_a_second_client_on_the_line_is_refused_until_the_first_says_bye() -> No
 
 
 def test_serial_line_and_http_at_once_are_two_clients_even_under_one_session() -> None:
-    agent = Agent(Recorder(), 10.0)
+    agent = BoardAgent(Recorder(), 10.0)
     assert agent.claim("HTTP", 3) == ""
     assert ask(agent, 3, "HELLO").split(b" ")[1] == b"21"
     assert agent.claim("HTTP", 4, arm=False).startswith("another client is in charge (on HTTP, heard 0 s ago)")
@@ -227,7 +227,7 @@ class Strange(Recorder):
 def test_a_state_that_cannot_be_parsed_is_a_pass_that_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board_agent, "RETRY_S", (0.01, 0.01))
     device = Strange()
-    agent = Agent(device, 0.05)
+    agent = BoardAgent(device, 0.05)
     assert agent.claim("HTTP", 3) == ""
     agent.start()
     AgentLab.until(lambda: len(device.asked) == 2)
@@ -466,7 +466,7 @@ def test_a_line_nobody_reads_does_not_stop_the_agent(tmp_path: Path, monkeypatch
     master, slave = pty.openpty()
     tty.setraw(slave)
     os.set_blocking(slave, False)
-    port = board_agent.SerialPort(os.ttyname(slave), 115200, Agent(Recorder(), 10.0))
+    port = board_agent.SerialPort(os.ttyname(slave), 115200, BoardAgent(Recorder(), 10.0))
     for byte in (b"x", b"y"):
         port._write(slave, 20_000 * byte)  # comes back
     os.close(master)

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from hardware.board import board_agent
-from hardware.board.board_agent import Agent, Device, Proxy
+from hardware.board.board_agent import BoardAgent, Device, Proxy
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
@@ -142,7 +142,7 @@ def test_what_is_refused_is_no_sign_of_life(door: tuple[Proxy, Recorder]) -> Non
 
 def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here() -> None:
     device = Server()
-    proxy = serve(Agent(Device(device.url, 2.0), 600.0))
+    proxy = serve(BoardAgent(Device(device.url, 2.0), 600.0))
     port = proxy.server_address[1]
     assert ask(port, "POST", PUMP, "X-Requested-With: XMLHttpRequest")[0] == 401
     assert ask(port, "POST", PUMP, "Origin: http://evil.example", BEARER)[0] == 403
@@ -180,7 +180,7 @@ def test_what_the_agent_answers_over_http(guarded: HttpLab) -> None:
 # -- what a request looks like ---------------------------------------------------------------------------------------
 
 
-def serve(agent: Agent) -> Proxy:
+def serve(agent: BoardAgent) -> Proxy:
     proxy = Proxy(("127.0.0.1", 0), agent, TOKEN.encode(), ["board.local"])
     threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
     return proxy
@@ -194,7 +194,7 @@ def close(proxy: Proxy) -> None:
 @pytest.fixture
 def door() -> Iterator[tuple[Proxy, Recorder]]:
     device = Recorder()
-    proxy = serve(Agent(device, 600.0))
+    proxy = serve(BoardAgent(device, 600.0))
     yield proxy, device
     close(proxy)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hardware.board import board_agent
-from hardware.board.board_agent import Agent, Device
+from hardware.board.board_agent import BoardAgent, Device
 from hardware.link.serial import encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_board_agent import Recorder
@@ -17,7 +17,7 @@ from tests.hardware.test_board_agent import Recorder
 class Wait(threading.Event):
     """An event whose `wait` passes the time by itself, until the end of the test."""
 
-    def __init__(self, end_s: float, meanwhile: dict[float, str], agent: "Agent") -> None:
+    def __init__(self, end_s: float, meanwhile: dict[float, str], agent: "BoardAgent") -> None:
         super().__init__()
         self.now, self._end_s, self._meanwhile, self._agent = 0.0, end_s, meanwhile, agent
 
@@ -42,7 +42,7 @@ class Watched:
     ) -> None:
         clock = SimpleNamespace(monotonic=lambda: 0.0, strftime=lambda form: "")
         monkeypatch.setattr(board_agent, "time", clock)
-        self.agent, self.seen = Agent(Recorder(), 120.0), list[float]()
+        self.agent, self.seen = BoardAgent(Recorder(), 120.0), list[float]()
         wait = Wait(end_s, meanwhile, self.agent)
         self.agent._stop, clock.monotonic = wait, lambda: wait.now
 
@@ -124,7 +124,7 @@ def test_a_pass_switches_every_pump_off_and_remembers_each_that_it_found_on() ->
     for pump, reactor in (("Pump1", "M0"), ("Pump2", "M0"), ("Pump4", "M1")):
         lab.pump(pump, 1.0, reactor=reactor)
     lab.wait(2.0)
-    agent = Agent(Emulated(lab), 120.0)
+    agent = BoardAgent(Emulated(lab), 120.0)
     assert agent.sweep(agent._beats) == []
     lab.wait(1.0)
     assert not any(any(lab.device.truth(m)["motors"].values()) for m in ("M0", "M1"))

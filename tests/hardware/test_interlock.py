@@ -13,7 +13,7 @@ from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.config import DONE, REMEDIES, RESPONSES, Response, SafetyConfig
-from hardware.safety.interlock import Interlock, Verdict, kinds_of
+from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
 
 class Drive:
@@ -36,7 +36,7 @@ class Drive:
         fresh: bool = True,
         dosed: bool = True,
         **receipt: Any,
-    ) -> Verdict:
+    ) -> Ruling:
         now = 60.0 * self.minute
         vitals = Vitals(np.array([age]), np.array([raw]), (fault,))
         m = Measurement(np.array([now]), np.array([od]), np.array([temperature]), np.array([fresh]), vitals)
@@ -58,7 +58,7 @@ def filed(interlock: Interlock) -> Any:
     return json.loads(json.dumps(interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
 
 
-def only(verdict: Verdict) -> tuple[str, ...]:
+def only(verdict: Ruling) -> tuple[str, ...]:
     return verdict.kinds[0]
 
 
@@ -134,7 +134,7 @@ LEVELS = np.linspace(0.0, 0.02, 17)
 
 def cultivate(
     plant: PlantConfig, n: int, minutes: int, spoil: tuple[int, str, float] | None = None, setpoint: float | None = None
-) -> tuple[Interlock, list[Verdict], Plant]:
+) -> tuple[Interlock, list[Ruling], Plant]:
     """N vials under an inverse law on 17 levels, setpoints 0.8, 0.65, 0.5, 0.3 for an hour each (or one for ever)."""
     vials = Plant(plant, n, np.random.default_rng(0))
     vials.reset(0.5, 37.0)
@@ -156,7 +156,7 @@ def cultivate(
     return interlock, verdicts, vials
 
 
-def count(verdicts: list[Verdict], kind: str) -> int:
+def count(verdicts: list[Ruling], kind: str) -> int:
     return sum(kind in kinds for verdict in verdicts for kinds in verdict.kinds)
 
 
@@ -256,7 +256,7 @@ def test_one_reactor_of_eight_is_the_same_as_one_alone() -> None:
     together, alone = Interlock(8), [Interlock(1) for _ in range(8)]
     for k, row in enumerate(od):
 
-        def ask(lock: Interlock, values: np.ndarray, k: int = k) -> Verdict:
+        def ask(lock: Interlock, values: np.ndarray, k: int = k) -> Ruling:
             n = len(values)
             m = Measurement(np.full(n, 60.0 * k), values, np.full(n, 37.0), np.ones(n, bool))
             v = lock.check(m, np.full(n, 0.01), np.full(n, 0.5), np.full(n, 37.0), 60.0 * k)

@@ -8,7 +8,7 @@ import pytest
 from hardware.actuator import THERMOSTAT
 from hardware.reactor import Measurement
 from hardware.safety.config import Response, Responses, SafetyConfig
-from hardware.safety.interlock import Interlock, Verdict
+from hardware.safety.interlock import Interlock, Ruling
 
 NAN = np.nan
 
@@ -20,7 +20,7 @@ class Bench:
         self.n, self.minute = n, 0
         self.interlock = Interlock(n, SafetyConfig(mu_max=0.04, **config))
 
-    def step(self, *counts: float | None, fresh: bool = True) -> tuple[np.ndarray | None, Verdict]:
+    def step(self, *counts: float | None, fresh: bool = True) -> tuple[np.ndarray | None, Ruling]:
         """Believed counts and verdict of a sample with these counts; None: fluorescence is not measured."""
         self.minute += 1
         light = None if counts == (None,) else np.array(counts, dtype=float)

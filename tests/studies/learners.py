@@ -26,7 +26,7 @@ from envs.coculture.task import CocultureConfig, advance, passed, share
 from experiments.cli import files
 from experiments.cli.stop import Workers
 from experiments.laws import registry
-from experiments.laws.share.base import Array, Estimate, Wanted
+from experiments.laws.share.base import Array, ShareEstimate, Wanted
 from experiments.reporting.tables import number
 from experiments.train import main as train
 from experiments.training import build, tasks
@@ -192,7 +192,7 @@ def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
         following = share(goal[:, 1]) if config.preview_min else wanted
         left = goal[:, 2] if config.preview_min else np.zeros(n)
         for minute in range(each_min):
-            believed = Estimate(state[:, 0], np.full(n, 0.01), state[:, 1], state[:, 2], *np.zeros((3, n)))
+            believed = ShareEstimate(state[:, 0], np.full(n, 0.01), state[:, 1], state[:, 2], *np.zeros((3, n)))
             told = Wanted(wanted, following, np.maximum(left - minute, 0.0) * (left > 0.0))
             target = law.act(believed, told, np.full(n, k * each_min + minute), np.ones(n, dtype=np.bool_))
             state = advance(config, state, target, 1.0)

@@ -93,10 +93,10 @@ def _one_thread(work: Callable[[], object]) -> None:
 def _train(config: DQNConfig) -> None:
     """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
     from experiments.training import build
-    from experiments.training.density import Density
+    from experiments.training.density import DensityTask
 
     def run() -> None:
-        list(build.population(Density(EnvConfig()), config, range(1)).run())
+        list(build.population(DensityTask(EnvConfig()), config, range(1)).run())
 
     _one_thread(run)
 

@@ -60,7 +60,7 @@ class DensityEstimator(Remembers, Protocol):
         """Return what is behind the estimates, by name, (N,) each."""
 
 
-class Kind(NamedTuple):
+class EstimatorKind(NamedTuple):
     """What makes an estimator of config and model, and what decides in it beside its config, by name."""
 
     config: type[Any]
@@ -68,7 +68,7 @@ class Kind(NamedTuple):
     fixed: Callable[[], Mapping[str, Any]]
 
 
-KINDS = {"kalman": Kind(EstimatorConfig, Estimator, fixed)}
+KINDS = {"kalman": EstimatorKind(EstimatorConfig, Estimator, fixed)}
 
 
 def add(
@@ -88,7 +88,7 @@ def add(
     """
     if kind in KINDS:
         raise ValueError(f"estimator {kind}: there is one of this name already; choose another")
-    KINDS[kind] = Kind(config, make, fixed)
+    KINDS[kind] = EstimatorKind(config, make, fixed)
 
 
 def config_at(kind: str, key: str = "controller.estimator") -> Any:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from experiments.laws.base import Array, Mask
 from hardware.memory import Remembers
 
-__all__ = ["Acts", "Array", "Estimate", "Law", "Mask", "ShareEstimator", "Wanted"]
+__all__ = ["Acts", "Array", "Law", "Mask", "ShareEstimate", "ShareEstimator", "Wanted"]
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ShareEstimate:
     """What is believed of N cultures.
 
     logit: of the share r of the second species. sd: of that logit. temperature: of the vial, degC. rate: lagged growth
@@ -30,9 +30,9 @@ class Estimate:
     error_p: Array
     thermometer: Array
 
-    def of(self, idx: NDArray[np.intp]) -> "Estimate":
+    def of(self, idx: NDArray[np.intp]) -> "ShareEstimate":
         """Return the estimate of some of the cultures."""
-        return Estimate(*(getattr(self, f.name)[idx] for f in fields(self)))
+        return ShareEstimate(*(getattr(self, f.name)[idx] for f in fields(self)))
 
     @property
     def errors(self) -> Array:
@@ -93,7 +93,7 @@ class ShareEstimator(Remembers, Protocol):
     def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
         """Minute, method and arguments of what was called in earlier lives of a run, in order, behind `known`."""
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> ShareEstimate:
         """Return the current estimate."""
 
     def explain(self) -> dict[str, Array]:
@@ -103,7 +103,7 @@ class ShareEstimator(Remembers, Protocol):
 class Acts(Protocol):
     """Chooses thermostat targets from an estimate. Rows are independent."""
 
-    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         """Thermostat targets, degC, (N,), called once per control period of the density.
 
         A law with a longer period of its own keeps its target until that is over. Args: minute: since the program

@@ -9,7 +9,7 @@ from conf.schema import check, setting
 from envs.bench import Bench
 from envs.coculture.pair import PairConfig
 from envs.plant.fluorescence import DAY_MIN
-from experiments.laws.share.base import Array, Estimate, Mask
+from experiments.laws.share.base import Array, Mask, ShareEstimate
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 
@@ -393,7 +393,7 @@ class CompositionEstimator:
         """Mean over the starts of each culture, (N,), of values (N, K)."""
         return np.asarray((self._weights() * of_starts).sum(axis=1))
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> ShareEstimate:
         """Share, temperature and rates as they are believed; before the first reading the first guess."""
         z, mixed = self.mean, self._mixed
         logit, error = mixed(z[..., LOGIT]), mixed(z[..., THERMOMETER])
@@ -401,7 +401,7 @@ class CompositionEstimator:
         weight, _ = _through(z[..., THERMOMETER])
         rate = mixed(np.einsum("nc,nkc->nk", self._lagged[:, 1], weight) * (1.0 + z[..., BIAS_P]))
         errors = mixed(z[..., BIAS_E]), mixed(z[..., BIAS_P])
-        return Estimate(logit, np.sqrt(np.maximum(variance, 0.0)), self._temperature + error, rate, *errors, error)
+        return ShareEstimate(logit, np.sqrt(np.maximum(variance, 0.0)), self._temperature + error, rate, *errors, error)
 
     def growth_errors(self) -> tuple[Array, Array]:
         """Relative errors of both growth curves and their sds, (N, 2) each."""

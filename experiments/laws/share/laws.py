@@ -11,7 +11,7 @@ from conf.schema import check, part, setting
 from envs.coculture.optimum import best_action
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, logit
-from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
 from experiments.laws.share.estimator import CompositionEstimatorConfig
 
 __all__ = [
@@ -55,7 +55,7 @@ class Periodic(ABC, Generic[Config]):
         """See `Law.reset`."""
         self._target, self._next = np.full(n, self._even_c), np.zeros(n)
 
-    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         """See `Law.act`."""
         idx = np.flatnonzero(rows & (minute >= self._next - 1e-6))
         if idx.size:
@@ -67,7 +67,7 @@ class Periodic(ABC, Generic[Config]):
         return self._target.copy()
 
     @abstractmethod
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         """Decide true temperatures for the rows `idx`, whose estimates and wishes are given, degC; the caller clips."""
 
 
@@ -84,7 +84,7 @@ class Proportional(Periodic[ProportionalConfig]):
     T_0 is where the estimated growth curves cross: 33.2 degC, were they without error.
     """
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         error = logit(wanted.setpoint) - estimate.logit
         return np.asarray(self.pair.even(estimate.errors) - self._colder * self.config.gain * error)
 
@@ -112,7 +112,7 @@ class PI(Periodic[PIConfig]):
         super().reset(n)
         self._integral = np.zeros(n)
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         error = wanted.setpoint - estimate.share
         further = self._integral[idx] + self.config.integral * error
         target, (low, high) = self._law(error, further), self.pair.temperatures
@@ -135,7 +135,7 @@ class BangBangConfig(LawConfig):
 class BangBang(Periodic[BangBangConfig]):
     """T = 29 while the share is too small, else 36."""
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         return np.where(logit(wanted.setpoint) > estimate.logit, self.pair.raising, self.pair.lowering)
 
 
@@ -154,7 +154,7 @@ class InverseDynamics(Periodic[InverseDynamicsConfig]):
     (1 + b_e) mu_e(T) = m_p - (logit s - logit r) / reach
     """
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         reach_h = self.config.reach_min / 60.0
         rate = estimate.rate - (logit(wanted.setpoint) - estimate.logit) / reach_h
         return self.pair.first_at(rate / (1.0 + estimate.error_e))
@@ -171,7 +171,7 @@ class MyopicConfig(LawConfig):
 class Myopic(Periodic[MyopicConfig]):
     """The one of 17 temperatures after which, by the model, the share is nearest to the setpoint."""
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         state, errors = estimate.state, estimate.errors
         return self.model.targets()[best_action(self.model, None, None, state, wanted.setpoint, errors)]
 
@@ -198,7 +198,7 @@ class Midpoint(InverseDynamics):
         super().reset(n)
         self._towards = np.full(n, np.nan)  # setpoint that the share is on its way to before it is asked for
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now, following = logit(wanted.setpoint), logit(wanted.following)
         change = np.sign(following - now)
         known = (wanted.minutes > 0.0) & (change != 0.0)
@@ -209,7 +209,7 @@ class Midpoint(InverseDynamics):
         self._towards[idx] = np.where(moving, wanted.following, np.nan)
         return np.where(moving, full, super()._decide(estimate, wanted, minute, idx))
 
-    def _reached(self, estimate: Estimate, target: Array, minutes: Array) -> Array:
+    def _reached(self, estimate: ShareEstimate, target: Array, minutes: Array) -> Array:
         """Logit after `minutes`, (N,), at targets (N,), by the estimated curves; to the nearest period."""
         state, steps = estimate.state, np.rint(minutes / self.control_min)
         reached = state[:, 0].copy()

@@ -8,7 +8,7 @@ from conf.schema import build, require, setting
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
-from experiments.laws.share.base import Array, Estimate, Wanted
+from experiments.laws.share.base import Array, ShareEstimate, Wanted
 from experiments.laws.share.laws import Index, LawConfig, Periodic
 
 __all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
@@ -67,7 +67,7 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
         allowed = "the run's own: train one with pair=... of the run, or give a law without a policy"
         require(_unnamed(known) == _unnamed(self.pair), "policy's pair", said, allowed)
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now = logit(wanted.setpoint)
         known = self.policy.metadata["model"].get("scale_e", 1.0)
         rate = estimate.rate - (1.0 + estimate.error_e - known) * self.pair.rates(self._even_c)[0]

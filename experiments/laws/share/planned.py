@@ -9,7 +9,7 @@ from conf.schema import setting
 from envs.coculture.optimum import best_action, cost_to_go, transitions
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig
-from experiments.laws.share.base import Array, Estimate, Wanted
+from experiments.laws.share.base import Array, ShareEstimate, Wanted
 from experiments.laws.share.laws import Index, LawConfig, Periodic
 from experiments.laws.share.program import Program
 
@@ -22,7 +22,7 @@ def _ahead(model: CocultureConfig, setpoints: tuple[float, ...]) -> Array:
     return np.asarray(cost_to_go(transitions(model), np.array(setpoints)[:, None])[0, :, 0])
 
 
-def _best(model: CocultureConfig, value: Array | None, estimate: Estimate, setpoint: Array) -> Array:
+def _best(model: CocultureConfig, value: Array | None, estimate: ShareEstimate, setpoint: Array) -> Array:
     """Choose the best temperature now, by the estimated curves; what comes after it by the model's."""
     chosen = best_action(model, transitions(model), value, estimate.state, setpoint, estimate.errors)
     return np.asarray(model.targets()[chosen])
@@ -47,7 +47,7 @@ class Receding(Periodic[RecedingConfig]):
         self.steps = max(round(config.horizon_min / config.control_min), 1)
         super().__init__(config, pair)
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         until = np.where(wanted.minutes > 0.0, np.ceil(wanted.minutes / self.control_min - 1e-6), self.steps)
         kinds = np.stack([wanted.setpoint, wanted.following, np.minimum(until, self.steps)], axis=1).round(6)
         target = np.empty(idx.size)
@@ -83,7 +83,7 @@ class Optimum(Periodic[OptimumConfig]):
         self._value: Array | None = None
         super().__init__(config, pair)
 
-    def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
+    def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         if self._value is None:
             self._value = cost_to_go(transitions(self.model), self._asked[:, None])[:, :, 0]
         step = np.clip(np.floor(minute / self.control_min + 1e-6), 0, len(self._asked) - 1).astype(np.intp)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.laws.share.base import Array, Estimate, Mask
+from experiments.laws.share.base import Array, Mask, ShareEstimate
 from experiments.laws.share.estimator import CompositionEstimator
 
 __all__ = ["Recall"]
@@ -169,7 +169,7 @@ class Recall:
                     return
                 self._chapters[again.chapter].then = copy.deepcopy(again.estimator)
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> ShareEstimate:
         """Return the current estimate."""
         return self.estimator.estimate()
 
