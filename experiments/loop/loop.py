@@ -29,7 +29,7 @@ OURS = (THERMOSTAT, *SPARE.values())  # the others reach the reactors by their n
 OWN = memory.Words("{value}, expected keys and values", WRONG, WRONG, "{key} is for {k} reactors, this run has {n}")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Step:
     """One pass through the loop; arrays (N,).
 
@@ -184,11 +184,30 @@ class ClosedLoop:
                 reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]
 
         decision = Step(
-            now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
-            np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(), columns,
-            [self.position(n) for n in range(len(self.done))], ended,
-            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump, believed,
-        )  # fmt: skip
+            now_s=now,
+            rows=rows,
+            minute=minute,
+            elapsed=elapsed,
+            phase=phase,
+            od=m.od,
+            temperature=m.temperature,
+            setpoint=setpoint,
+            proposed=proposed,
+            rate=verdict.rate,
+            volume_ml=np.full(len(self.done), np.nan),
+            reasons=reasons,
+            response=verdict.response,
+            notes=(),
+            explanation=explanation,
+            done=self.done.copy(),
+            columns=columns,
+            position=[self.position(n) for n in range(len(self.done))],
+            ended=ended,
+            raw=None if m.vitals is None else m.vitals.raw,
+            blank=None if m.vitals is None else m.vitals.blank,
+            pump=pump,
+            believed=believed,
+        )
         if self._before_dose is not None:
             self._before_dose(decision)
         faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
