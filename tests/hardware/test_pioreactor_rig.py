@@ -3,8 +3,6 @@
 Each takes half a minute. What can go wrong in and between doses is in tests/campaigns/pioreactor_faults.py.
 """
 
-import os
-
 import numpy as np
 import pytest
 
@@ -30,11 +28,10 @@ def bench(request, tmp_path):
         made.end()
 
 
-def test_the_remedy_of_the_preflight_for_a_killed_dose_works(bench):
+def test_the_remedy_of_the_preflight_for_a_killed_dose_works(bench, monkeypatch):
+    bench.kill_a_dose(monkeypatch)
     bench.dose(1.2)
-    assert bench.go_on(30.0, bench.pumping)
-    for pid in bench.rig.jobs(UNIT, "add_media"):
-        os.kill(pid, 9)
+    assert bench.go_on(lambda: bench.killed > 0)
     bench.die()
     forget = facts(bench.rig.version).forget
     reactors = PioreactorReactors(bench.config, RealClock())
@@ -48,8 +45,8 @@ def test_the_remedy_of_the_preflight_for_a_killed_dose_works(bench):
         bench.rig.cut(UNIT)
         bench.rig.boot(UNIT)
     bench.live()
-    assert bench.settled(200.0)
-    assert bench.sample(90.0)
+    assert bench.settled()
+    assert bench.sample()
     assert bench.dose(0.3) == 0.3
     assert bench.settled()
     bench.reactors.stop()
@@ -60,12 +57,12 @@ def test_the_vendors_turbidostat_takes_over_and_is_ended(bench):
     assert not failed
     assert bench.reactors.handed_over[0]
     assert bench.dose(0.5) == 0.0
-    assert bench.go_on(90.0, bench.pumping), "the culture is above its target"
+    assert bench.go_on(bench.pumping), "the culture is above its target"
     assert bench.station.book.fault is None
     assert bench.reactors.give_up(ALL) == []
     assert not bench.pumping()
     before = bench.truth()
-    assert not bench.go_on(25.0, bench.pumping), "it looks every 15 s"
+    assert not bench.go_on(bench.pumping, 25.0), "it looks every 15 s"
     assert bench.truth() == before
     assert not bench.rig.jobs(UNIT, "dosing_automation")
 
@@ -76,18 +73,18 @@ def test_stirring_and_thermostat_run_follow_their_target_and_come_back_after_a_r
     def running():
         return all(box.state(job).word == "ready" for job in ("stirring", "temperature_automation"))
 
-    assert bench.go_on(40.0, running)
-    assert bench.go_on(20.0, lambda: bench.station.newest.temperature > 20.0)
+    assert bench.go_on(running)
+    assert bench.go_on(lambda: bench.station.newest.temperature > 20.0)
     assert bench.station.newest.temperature == pytest.approx(bench.temperature(), abs=0.5)
     bench.station.set_temperature(33.0)
-    assert bench.go_on(20.0, lambda: box.target == 33.0)
+    assert bench.go_on(lambda: box.target == 33.0)
     assert bench.target() == 33.0
     bench.rig.cut(UNIT)
     bench.rig.boot(UNIT)
-    assert bench.go_on(30.0, lambda: bench.station.book.fault is not None)
-    assert bench.go_on(90.0, running)
+    assert bench.go_on(lambda: bench.station.book.fault is not None)
+    assert bench.go_on(running)
     assert bench.target() == 33.0
-    assert bench.sample(60.0)
+    assert bench.sample()
     assert bench.dose(0.4) == 0.4
     assert bench.settled()
     assert bench.reactors.heat_off(ALL) == []

@@ -25,16 +25,17 @@ from hardware.rig import build
 from hardware.rig.files import flows
 from hardware.rig.processes import _as_on_a_unit
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
-from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig, started
+from tests.hardware.pioreactor_bench import PACKAGES, UNIT, need_the_rig, started
+from tests.patience import PATIENCE_S
 
-pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig at a time
+pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(2.0 * PATIENCE_S)]  # one rig at a time
 rig = pytest.mark.slow
 
-LONG_S = 60.0  # a deadline that a busy computer meets
+ENDLESS_S = 4.0 * PATIENCE_S  # a run of a pump that does not end by itself while a test waits
 
 
 def until(holds: Callable[[], bool]) -> bool:
-    end = time.monotonic() + LONG_S
+    end = time.monotonic() + PATIENCE_S
     while not (held := holds()) and time.monotonic() < end:
         time.sleep(0.05)
     return held
@@ -46,7 +47,7 @@ class Asked:
     def __init__(self, package: str) -> None:
         self.rig = started({UNIT: 14.0}, RigConfig(package=package, od=0.5), experiment="e1")
         self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
-        self.web = Web(self.rig.web[UNIT], "e1", 20.0)
+        self.web = Web(self.rig.web[UNIT], "e1", PATIENCE_S)
 
     def reached(self) -> PioreactorConfig:
         """How the driver reaches it."""
@@ -86,13 +87,18 @@ class Asked:
     def fed_ml(self) -> float:
         return float(self.vial.plant.feed.delivered_ml[0])
 
+    def pulsed_ml(self) -> float:
+        """By the on-times of the media pump's pin."""
+        on_s = sum(pulse.seconds for pulse in self.vial.pulses if pulse.pump == "media")
+        return on_s * flows(0)["media_pump"]
+
     def pumping(self) -> bool:
         return self.vial.duty[MEDIA] > 0.0
 
     def pio(self, command: str) -> int:
         """Exit status of one of the vendor's commands, typed on the unit."""
         words = [str(self.rig.folder / UNIT / "pio"), *command.split()[1:]]
-        return subprocess.run(words, capture_output=True, check=False, timeout=LONG_S).returncode
+        return subprocess.run(words, capture_output=True, check=False, timeout=PATIENCE_S).returncode
 
     @contextmanager
     def at_once(self, status: dict[str, int]) -> Iterator[None]:
@@ -135,10 +141,12 @@ def test_all_that_runs_on_a_bench_runs_here(unit):
 
 @rig
 def test_a_dose_reaches_the_vial_and_its_task_is_a_success(unit):
-    before, had = unit.fed_ml(), len(unit.vial.pulses)
+    """As much as its pin was on, which is what was asked or, on a busy computer, more: its job times itself."""
+    fed, pulsed, had = unit.fed_ml(), unit.pulsed_ml(), len(unit.vial.pulses)
     task = unit.run("add_media", {"ml": 0.4})
     assert until(lambda: len(unit.vial.pulses) > had)
-    assert unit.fed_ml() - before == pytest.approx(0.4, abs=EACH_ML)
+    assert unit.fed_ml() - fed == pytest.approx(unit.pulsed_ml() - pulsed)
+    assert unit.fed_ml() - fed > 0.39
     assert unit.finished(task) is True
 
 
@@ -154,12 +162,10 @@ def test_a_task_whose_job_cannot_start_has_failed(unit):
 
 @rig
 def test_a_stop_ends_its_job(unit):
-    before = unit.fed_ml()
-    unit.run("add_media", {"duration": 60.0})
+    unit.run("add_media", {"duration": ENDLESS_S})
     assert until(unit.pumping)
     unit.web.stop("add_media")
     assert until(lambda: not unit.pumping())
-    assert unit.fed_ml() - before < 60.0
     assert until(lambda: "add_media" not in unit.jobs())
 
 
@@ -177,17 +183,18 @@ def test_each_pump_is_told_by_the_pin_of_its_channel(unit):
             cluster.publish(f"pioreactor/{UNIT}/e1/stirring/duty_cycle/set", f"{30.51 + 0.01 * k:g}")
             assert until(lambda at=at: box.dc_s > at)
         for job, pin in (("add_media", 13), ("remove_waste", 12)):
-            unit.run(job, {"duration": 2.0})
+            unit.run(job, {"duration": ENDLESS_S})
             assert until(lambda pin=pin: box.on() == [pin])
+            unit.web.stop(job)
             assert until(lambda: not box.on())
-            assert box.pins[pin].ran_s == pytest.approx(2.0, abs=1.0)
+            assert box.pins[pin].ran_s > 0.0
     finally:
         cluster.close()
 
 
 @rig
 def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_command(unit):
-    unit.run("add_media", {"duration": 60.0})
+    unit.run("add_media", {"duration": ENDLESS_S})
     assert until(unit.pumping)
     for pid in unit.rig.jobs(UNIT, "add_media"):
         os.kill(pid, signal.SIGKILL)
@@ -243,7 +250,7 @@ def test_the_unit_keeps_a_ledger_that_can_be_set_where_the_table_says_so(unit):
 
 @rig
 def test_the_leader_says_which_experiment_a_unit_is_in(unit):
-    other = Web(unit.rig.web[UNIT], "e2", 20.0)
+    other = Web(unit.rig.web[UNIT], "e2", PATIENCE_S)
     assert [bool(web.astray(name)) for web, name in ((unit.web, UNIT), (unit.web, "pio09"), (other, UNIT))] == [
         False, True, True,
     ]  # fmt: skip
@@ -328,7 +335,7 @@ def test_what_the_rig_starts_hears_ctrl_c_whoever_started_the_rig():
         signal.signal(signal.SIGINT, before)
     job.send_signal(signal.SIGINT)
     try:
-        assert job.wait(LONG_S) == -signal.SIGINT
+        assert job.wait(PATIENCE_S) == -signal.SIGINT
     finally:
         job.kill()
 
