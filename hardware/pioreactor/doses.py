@@ -166,9 +166,11 @@ class Doses:
             pumps.counted[MEDIA, dose] = pumps.counted[WASTE, dose] = math.inf
             media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, plan.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
-                ago_s = pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
-                asked_s, ran_s = self._clock.now() - ago_s, pumps.pin(MEDIA).ran_s
-                seen = yield from pumps.follow(Request(MEDIA, asked_ml, dose, asked_s, ran_s, history.task))
+                now, ago_s = self._clock.now(), pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
+                found, pin = Request(MEDIA, 0.0, dose, now, pumps.pin(MEDIA).ran_s), pumps.pin(MEDIA)
+                there = pin.on or pumps.box.live(MEDIA)
+                asked = replace(found, ml=asked_ml, asked_s=now - ago_s, task=history.task)
+                seen = yield from pumps.follow(asked) if there else pumps.end(found)
                 end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
                 media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
         self._conclude(plan, dose, history.on_s, media, waste)
@@ -280,7 +282,7 @@ class Doses:
             self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
 
     def _theirs(self, job: str, ml: float, who: str, beside_ml: float = 0.0) -> None:
-        self.foreign = f"{job} of {ml:.2f} mL without our command ({who})"
+        self.foreign = f"{job} of {ml:.2f} mL more without our command ({who})"
         self._give(job, ml, ml, self.foreign, beside_ml)
 
     def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:

@@ -24,6 +24,7 @@ __all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Request", "Se
 T = TypeVar("T")
 
 MEDIA, WASTE = PUMPS[0], PUMPS[2]
+NAMES = dict(zip(PUMPS, ("media", "alt-media", "waste"), strict=True))
 OURS = "turbidostat/"
 STEP_S = 0.1
 SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
@@ -33,6 +34,8 @@ PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second re
 QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
 LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
+PAST_S = 0.5  # beyond its dose a media pump that is told on is drained
+PROOF_S = 20.0  # with a broker, in which a pump is proven off, or a hand must look at it
 NUDGE = 0.01  # of a duty, %: nobody sees it
 SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
 AGAIN_S = 15.0  # between two of them
@@ -138,6 +141,7 @@ class Pumps:
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
         self.flowed_ml, self.runs_on, self._untold = 0.0, False, 0
         self.proven: dict[str, float] = {}
+        self._calls = Calls(self.web, self.clock)
         self.ours = f"{OURS}{unit.run}/"
         self.short = f"{self.ours}{unit.name}/off"
 
@@ -169,6 +173,15 @@ class Pumps:
         """What to do about a lock that a killed process left."""
         word = f"{self.facts.purge} pwm_locks PIN --as-int (pins {', '.join(map(str, self.config.pump_pins))})"
         return f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word}"
+
+    def named(self, job: str) -> str:
+        """Name a pump, and the pin behind it."""
+        return f"the {NAMES[job]} pump (pin {self.box.jobs[job]})"
+
+    def told_on(self, job: str) -> bool:
+        """Whether the unit tells that a pump is on, since the broker is there, and not because of a short run."""
+        pin, broke_s, before_s = self.pin(job), self.mqtt.broke_s, self.clock.now() - SETTLE_S
+        return pin.on and pin.on_s < before_s and (broke_s <= pin.on_s or broke_s < self.box.dc_s < before_s)
 
     def ask_pins(self) -> None:
         """Have stirring say all pins again: by a duty that differs a little, for newer versions tell only changes."""
@@ -224,11 +237,28 @@ class Pumps:
             unwanted = self.halted or (self.cut and job == MEDIA)
             if unwanted or self.odd(job) or self.broke(request) or self.clock.now() > late:
                 return (yield from self.end(request))
+            if job != WASTE and (gave_ml := self._beyond(request)):
+                self.flowed_ml, self.runs_on = gave_ml, True
             yield STEP_S
+        self.runs_on = False
         self._untold = 0 if self.pin(job).on_s >= request.asked_s else self._untold + 1
         if self._untold > UNTOLD:
             self.box.dc_s = -math.inf  # until the unit tells its pins again
         return self._moved(request)
+
+    def _beyond(self, request: Request) -> float:
+        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard.
+
+        A unit that lost its power says nothing; one that has it is asked.
+        """
+        pin, flow, now = self.pin(request.job), self.flow_ml_s[request.job], self.clock.now()
+        on_s = max(pin.on_s, request.asked_s)
+        end_s = on_s + request.ml / flow
+        if not pin.on or now < end_s + PAST_S:
+            return 0.0
+        if self._calls.due("pins", 1.0):
+            self.ask_pins()
+        return (now - on_s) * flow if self.box.heard_s > end_s else 0.0
 
     def broke(self, request: Request) -> bool:
         """Whether the connection to the broker was lost since a run was asked for."""
@@ -306,19 +336,22 @@ class Pumps:
         while math.isnan(off_s := ending.off_s()):
             ending.act()
             late = self.clock.now() > ending.began + OVERRUN_S
-            told_on = pin.on and self.mqtt.broke_s < self.box.dc_s < self.clock.now() - SETTLE_S  # by no short run
-            if late and self.broke(request) and not (ending.lost or told_on):
-                self.trouble = f"the broker was lost in {job}, which ends with it; its pump is being verified off"
-            elif late:
-                number, unlock = self.box.jobs[job], f"{self.facts.purge} pwm_locks"
-                how = "whose process was killed or stands still" if ending.lost else "which should have ended"
-                plug = "pull the pump's plug" if pin.on else "look at the pump; if it runs, pull its plug"
-                remedy = f"{plug}, or on the unit: {unlock} {number} --as-int (it is then ended from here)"
-                self.trouble = f"pin {number} {'runs' if pin.on else 'may run'} on after {job}, {how}; {remedy}"
+            if late:
+                ended = "which lost the broker" if self.broke(request) else "which should have ended"
+                how = "whose process was killed or stands still" if ending.lost else ended
+                off = f"or on the unit: {self.facts.purge} pwm_locks {self.box.jobs[job]} --as-int"
+                if self.told_on(job):
+                    self.trouble = f"{self.named(job)} runs on after {job}, {how}; pull its plug, {off}"
+                elif ending.failed:
+                    look = "look at it; if it runs, pull its plug"
+                    self.trouble = f"{self.named(job)} may run on after {job}, {how}; {look}, {off}"
+                else:
+                    self.trouble = f"{self.named(job)} is being verified off after {job}, {how}"
             self.waits = late or self.waits
-            if job == MEDIA:
+            if job != WASTE:
                 self.flowed_ml = ending.flowed()
-                self.runs_on = self.flowed_ml > 0.0 and (late or (self.lost(job) and pin.on))
+                now = late or (self.lost(job) and pin.on) or self._beyond(request) > 0.0
+                self.runs_on = self.flowed_ml > 0.0 and now
             yield STEP_S
         self.trouble, self.waits, self.runs_on = "", False, False
         self.proven[job] = self.clock.now()
@@ -363,6 +396,7 @@ class ForcedEnd:
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
         self._quiet_s = self._still_s = math.inf
+        self._apart_s = self.began
         self._short: Future[str] | None = None
         self._rebooted = self.lost = self._held = False
 
@@ -371,8 +405,9 @@ class ForcedEnd:
         return self._p.reported.get((self._job, self._p.short), 0.0)
 
     def act(self) -> None:
-        """Ask what is due."""
+        """Ask what is due; a job that is there is given some seconds to end by itself."""
         p, job, passed, calls = self._p, self._job, self._p.clock.now() - self.began, self._calls
+        self._apart_s = self._apart_s if p.mqtt.connected else p.clock.now()
         if calls.due("mqtt", 1.0):
             p.unit.say(f"{job}/$state/set", "disconnected")
         if passed > 1.0 and calls.due("pins", 5.0):
@@ -385,7 +420,8 @@ class ForcedEnd:
             self._short = None
         may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
         may_run = may_run and p.mqtt.connected and self._short is None  # what it tells, else it runs unseen
-        if may_run and passed > 5.0 and self._barrier.passed() and calls.due("short", 2.0):
+        soon = not (p.box.live(job) or p.pin(job).on or self._request.ml > 0.0)
+        if may_run and (soon or passed > 5.0) and self._barrier.passed() and calls.due("short", 2.0):
             self._short_s = min(self._short_s, p.clock.now())
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
@@ -407,6 +443,13 @@ class ForcedEnd:
         short = "" if math.isinf(self._short_s) else "ended" if ended else "asked"
         told = "on" if pin.on else told or ("off" if pin.off_s >= self._since else "")
         return Seen(self._rebooted, told, short, p.last_word(self._request))
+
+    @property
+    def failed(self) -> bool:
+        """Whether no proof came: a short run found a lock, or it takes too long."""
+        now, state = self._p.clock.now(), self._p.box.state(self._job)
+        refused = state.word == "disconnected" and self._short_s < state.at < now - SETTLE_S
+        return now > self._apart_s + PROOF_S or (refused and self._shorts() == self._shorts_before)
 
     def off_s(self) -> float:
         """When the pump was off at the latest, nan while that is not proven."""

@@ -11,7 +11,7 @@ from contextlib import suppress
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, History
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
-from hardware.pioreactor.mailbox import AUTOMATIONS
+from hardware.pioreactor.mailbox import AUTOMATIONS, PUMPS
 from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, boot_of
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
@@ -310,9 +310,9 @@ class Station:
                 or any(box.live(job) or pumps.odd(job) for job in (MEDIA, WASTE))
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
-                    seen = "not verified off; look at its pumps, pull the plug of one that runs"
-                    if box.on() or any(map(pumps.odd, (MEDIA, WASTE))):
-                        seen = f"pin {(*box.on(), 'of a killed job')[0]} on; pull the plug of its pumps"
+                    on = [pumps.named(job) for job in PUMPS if pumps.told_on(job)]
+                    off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
+                    seen = f"{on[0]} on; pull its plug" if on else f"not verified off; {off}"
                     why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"
                     raise DeviceStateError(f"pumps of {self.name}: {seen}. {why}")
                 self.go_on()

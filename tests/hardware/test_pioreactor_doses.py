@@ -243,7 +243,7 @@ def test_stop_that_cannot_be_verified_says_which_plug(lab, broker):
     begun = len(lab.asked("remove_waste"))
     if not broker:
         lab.world.lose_broker(1e6)
-    with pytest.raises(DeviceStateError, match="pull the plug"):
+    with pytest.raises(DeviceStateError, match="pull (its|the) plug"):
         lab.reactors.stop()
     assert len(lab.asked("remove_waste")) == begun, "no pump is started by a stop"
     assert set(lab.world.since) == {MEDIA_PIN}, "and none goes on after it but the one that cannot be stopped"
@@ -291,7 +291,8 @@ def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypa
     took = again.until(lambda: bool(again.of("dose_end")), 100.0)
     assert took <= 100.0
     (end,) = again.of("dose_end")
-    assert end["feed_low_ml"] <= world.truth["add_media"] <= end["feed_ml"] + 0.02
+    low, high = again.given()  # with short runs that prove it off
+    assert low <= world.truth["add_media"] <= high + 0.02
     assert end["waste_ml"] <= world.truth["remove_waste"] + 1e-6
     assert end["feed_ml"] <= 0.85
     assert len(again.asked("add_media")) == 1
@@ -319,11 +320,11 @@ def test_after_a_resume_nobody_is_told_to_pull_a_plug_while_no_pump_is_told_on(m
     again = Lab(monkeypatch, world)
     again.begin(replay(rows)[UNIT], 80.0)
     told = []
-    while again.station.doses.running or again.fault:
-        told += [str(again.fault), *again.reactors.pumps_off(np.array([True]))]
-        again.wait(5.0)
-    assert not [line for line in told if "pull the plug of its pumps" in line or "pull the pump's plug" in line]
-    assert bool(told) is not rebooted, "a unit that booted has all pins at 0"
+    again.until(lambda: told.append(str(again.fault)) or not again.station.doses.running, 15.0)
+    again.until(lambda: told.extend(again.reactors.pumps_off(np.array([True]))) or again.fault is None, 1.0)
+    assert not [line for line in told if "plug" in line]
+    again.sample()
+    assert again.dose(0.5) == 0.5
 
 
 def test_a_run_without_a_thermostat_is_resumed_from_its_journal_on_the_disk(monkeypatch, tmp_path):
@@ -353,8 +354,9 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     lab.world.revive()  # it runs late
     lab.wait(140.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.5]
-    ((_, correction),) = lab.reactors.repeated()  # its waste is not on record, and was booked when it began
-    assert (correction.volume_ml[0], correction.waste_ml[0]) == (0.0, -0.5)
+    ledger = lab.ledger(0.5)  # its waste is not on record, and was booked when it began
+    assert float(ledger.volume_ml[0]) >= lab.world.level_ml - 0.1
+    assert float(ledger.fed_ml[0]) >= lab.world.truth["add_media"] - 0.02
 
 
 def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
@@ -417,19 +419,6 @@ def test_pumps_off_while_a_run_goes_on_lets_the_waste_pump_end(lab):
     assert lab.world.truth["remove_waste"] == pytest.approx(2.0, abs=0.05)
 
 
-def crashed(monkeypatch, first_s, speed=1.0):
-    """The lab before and the lab after a crash `first_s` behind a dose of .8 mL that no pump took; not begun again."""
-    lab = Lab(monkeypatch, speed=speed)
-    lab.begin()
-    lab.sample()
-    lab.world.queue = False
-    lab.dose(0.8)
-    lab.wait(first_s)
-    again = Lab(monkeypatch, lab.world, speed=speed)
-    again.rows = list(lab.rows)
-    return lab, again
-
-
 def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put_off(lab):
     for asked, given, kept in (
         (0.03, 0.0, 0.03),
@@ -464,14 +453,17 @@ def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch
     assert float(ledger.volume_ml[0]) == pytest.approx(rim_ml, abs=0.1)  # a short run proves the pump off
 
 
-def test_a_drain_that_the_broker_and_then_the_end_of_a_run_cut_is_booked_with_the_least_that_it_took(lab):
+def test_a_drain_that_the_broker_and_then_the_end_of_a_run_cut_is_booked_with_the_least_that_it_took(monkeypatch):
+    monkeypatch.setitem(FLOW, "remove_waste", 0.9)
+    lab = Lab(monkeypatch)
+    lab.begin()
+    lab.sample()
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 4.0
     planned = lab.dose(0.7)
-    lab.until(lambda: WASTE_PIN in lab.world.since, 20.0)
-    lab.wait(0.5)
+    lab.until(lambda: set(lab.world.since) == {WASTE_PIN}, 20.0)
     lab.world.lose_broker(2.0)
     lab.reactors.stop()
-    assert lab.world.level_ml > 21.5
+    assert lab.world.level_ml > 20.5
     assert float(lab.ledger(planned).volume_ml[0]) >= lab.world.level_ml - 0.1
 
 
@@ -503,12 +495,17 @@ def test_each_pump_s_flow_is_that_of_its_own_calibration_and_on_record(lab):
     assert (row["device_id"], row["boot"]) == (UNIT, "boot1")
 
 
-def test_after_a_crash_of_a_fast_run_a_dose_is_late_by_real_time(monkeypatch):
-    """Five times faster: 20 s of the run are 4 s, and 12 s are allowed until its pump is seen to run."""
-    lab, again = crashed(monkeypatch, 0.5, speed=5.0)
-    again.begin(replay(again.rows)[UNIT], lab.of("intent")[0]["on_s"] + 20.0)
-    again.wait(4.0)
-    assert again.fault is None
-    again.wait(6.0)
-    assert again.fault is not None
-    assert "the fate of a dose of 0.80 mL (add_media) is unknown" in again.fault.detail
+def test_after_a_crash_a_pump_that_cannot_be_proven_off_is_told_after_a_while(monkeypatch):
+    """Five times faster; the task queue is dead, so no short run comes, and nobody tells the pump on."""
+    lab = Lab(monkeypatch, speed=5.0)
+    lab.begin()
+    lab.sample()
+    lab.world.queue = False
+    lab.dose(0.8)
+    lab.wait(0.5)
+    again = Lab(monkeypatch, lab.world, speed=5.0)
+    again.begin(replay(lab.rows)[UNIT], lab.of("intent")[0]["on_s"] + 20.0)
+    seen = []
+    again.until(lambda: seen.append(str(again.fault)) or "may run on" in seen[-1], 60.0)
+    told = list(dict.fromkeys(line for line in seen if "the media pump (pin 13)" in line or "plug" in line))
+    assert ["plug" in line for line in told] == [False, True]
