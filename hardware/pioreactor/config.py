@@ -65,6 +65,7 @@ class PioreactorConfig:
     max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
     waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
+    alt_media: bool = setting(False, "the alt-media pump has a tube and a fluid of its own; signals call it pump 3")
     start_s: float = setting(12.0, "real time in which an accepted dose must begin", "s", within=(2, 120))
     stop_s: float = setting(30.0, "real time a stop tries to verify the pumps off", "s", within=(1, 600))
 

@@ -13,10 +13,23 @@ import numpy as np
 
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
-from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, SETTLE_S, STEP_S, WASTE, Moved, Pumps, Request
+from hardware.pioreactor.pumps import (
+    ALT,
+    LATE_ML,
+    MEDIA,
+    NAMES,
+    OURS,
+    SETTLE_S,
+    SPARE,
+    STEP_S,
+    WASTE,
+    Moved,
+    Pumps,
+    Request,
+)
 from hardware.stations import Plan
 from hardware.storage import history as history_of
-from hardware.storage.doses import Ending, Given
+from hardware.storage.doses import Ending, Given, feeds_by
 
 __all__ = ["Doses", "History", "replay"]
 
@@ -27,9 +40,10 @@ UNSEEN = "its end was not on record: at most what was asked, unless its pump was
 
 @dataclass(frozen=True)
 class History(history_of.History):
-    """One unit's past; boot, when it had been started; of an open dose id, and task, the answer to its request."""
+    """One unit's past; boot, when it had been started; of an open dose pump, id and task, the answer to its request."""
 
     boot: str = ""
+    pump: int = 1
     id: str = ""
     task: str = ""
 
@@ -40,9 +54,9 @@ class History(history_of.History):
         """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
         known = super().after(row)
         if row["kind"] == "intent":
-            return replace(known, id=str(row["id"]), task="")
+            return replace(known, pump=int(feeds_by(row)[-1]), id=str(row["id"]), task="")
         if row["kind"] == "task" and row["id"] == known.id:
-            return replace(known, task=str(row["task"]), wasted=row["job"] != PUMPS[0])
+            return replace(known, task=str(row["task"]), wasted=row["job"] == WASTE)
         return known
 
 
@@ -68,7 +82,8 @@ class Doses:
         self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
-        self._ran_s, self._strange_ml = {MEDIA: 0.0, WASTE: 0.0}, {MEDIA: 0.0, WASTE: 0.0}
+        self._ran_s, self._strange_ml = dict.fromkeys(PUMPS, 0.0), dict.fromkeys(PUMPS, 0.0)
+        self._job = MEDIA  # that gave the last dose
         self._now_ml, self._told_ml = np.zeros(3), np.zeros(3)  # fed at most, at least, risen: in truth, and booked
         self._base_ml, self._taken_ml, self._ran_on = np.zeros(2), 0.0, False  # fed before this dose; of this dose
 
@@ -81,22 +96,26 @@ class Doses:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
         if history.open:
-            plan = Plan(history.feed_ml, history.waste_ml)
+            plan, self._job = Plan(history.feed_ml, history.waste_ml), ALT if history.pump == SPARE else MEDIA
             self._course = self._drained(self._look_for(history, plan), plan, history.id)
 
-    def plan(self, rate: float) -> Plan:
-        """Plan the dose of a mean rate, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
+    def plan(self, rate: float, pump: int = 1) -> Plan:
+        """Plan the dose of a mean rate, mL; only the feed's carries over. Raises: ValueError.
+
+        Args: rate: mL/s over a control period, >= 0. pump: number of the pump that gives it.
+        """
         if not (rate >= 0.0 and math.isfinite(rate)):
             raise ValueError(f"pump rate = {rate} mL/s: allowed finite numbers >= 0")
-        asked = rate * self.pumps.unit.bench.period_s + (self.carry_ml if rate > 0.0 else 0.0)
+        carries = rate > 0.0 and pump != SPARE
+        asked = rate * self.pumps.unit.bench.period_s + (self.carry_ml if carries else 0.0)
         if asked < self._config.min_dose_ml:
-            return Plan(carry_ml=asked if rate > 0.0 else self.carry_ml)
+            return Plan(carry_ml=asked if carries else self.carry_ml)
         feed = min(asked, self._config.max_dose_ml)
-        return Plan(feed, self._config.waste_factor * feed)
+        return Plan(feed, self._config.waste_factor * feed, 0.0 if carries else self.carry_ml)
 
-    def begin(self, rate: float, sample: tuple[float, int] | None, refusal: str) -> Plan:
+    def begin(self, rate: float, sample: tuple[float, int] | None, refusal: str, pump: int = 1) -> Plan:
         """Begin the dose for `sample`, or note what stands against it. Raises: as `plan`; what the log raises."""
-        plan = self.plan(rate)
+        plan = self.plan(rate, pump)
         if reason := refusal or self._obstacle(sample):
             if plan.feed_ml > 0.0:
                 self._book.tell(f"no dose: {reason}")
@@ -107,9 +126,10 @@ class Doses:
         dose, on_s = f"{self.pumps.ours}{self.pumps.unit.name}/{self._count}", self._book.elapsed()
         self._book.write(
             "intent", sample=sample, rate=rate, feed_ml=plan.feed_ml, waste_ml=plan.waste_ml, carry_ml=plan.carry_ml,
-            doses=self._count, on_s=on_s, id=dose,
+            doses=self._count, on_s=on_s, id=dose, **({"feed_pump": f"Pump{pump}"} if pump == SPARE else {}),
         )  # fmt: skip
         if dosing:
+            self._job = ALT if pump == SPARE else MEDIA
             self._course = self._drained(self._dose(plan, dose, on_s), plan, dose)
             self.work()
         return plan
@@ -127,7 +147,7 @@ class Doses:
         """Do what is due; called again and again."""
         if self._course is None:
             self._settle_pins()
-            if job := next((job for job in (MEDIA, WASTE) if self.pumps.odd(job)), ""):
+            if job := next((job for job in self.pumps.jobs if self.pumps.odd(job)), ""):
                 name = f"{self.pumps.short}/{self._book.elapsed():.0f}"
                 self._course = self._drained(self._silence(job, name), Plan(), name)
         if self._course is None or self._clock.now() < self._due:
@@ -136,7 +156,7 @@ class Doses:
             self._due = self._clock.now() + next(self._course)
         except StopIteration:
             self._course, self.ended_s = None, self._clock.now()
-            self._ran_s = {job: self.pumps.pin(job).ran_s for job in self._ran_s}
+            self._ran_s = {job: self.pumps.pin(job).ran_s for job in PUMPS}
             self._settle_strange()
 
     def take(self, events: list[Event]) -> None:
@@ -153,7 +173,7 @@ class Doses:
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
-        media, waste = (yield from self.pumps.give(MEDIA, plan.feed_ml, dose)), Moved()
+        media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
         if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (self.pumps.halted or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
@@ -163,12 +183,12 @@ class Doses:
         pumps, dose, asked_ml = self.pumps, history.id, plan.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
-            pumps.counted[MEDIA, dose] = pumps.counted[WASTE, dose] = math.inf
+            pumps.counted[self._job, dose] = pumps.counted[WASTE, dose] = math.inf
             media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, plan.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
                 now, ago_s = self._clock.now(), pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
-                found, pin = Request(MEDIA, 0.0, dose, now, pumps.pin(MEDIA).ran_s), pumps.pin(MEDIA)
-                there = pin.on or pumps.box.live(MEDIA)
+                pin = pumps.pin(self._job)
+                found, there = Request(self._job, 0.0, dose, now, pin.ran_s), pin.on or pumps.box.live(self._job)
                 asked = replace(found, ml=asked_ml, asked_s=now - ago_s, task=history.task)
                 seen = yield from pumps.follow(asked) if there else pumps.end(found)
                 end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
@@ -177,15 +197,19 @@ class Doses:
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
         """Conclude a dose: record its end, then correct what was booked since it began."""
-        self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
-        for moved, pump in ((media, "media"), (waste, "waste")):
+        for job, moved, ml in ((self._job, media, media.high), (WASTE, waste, waste.low)):
+            self.pumps.counted[job, dose] = ml
             if moved.end:
-                self._book.tell(f"{pump}: {moved.end}")
+                self._book.tell(f"{NAMES[job]}: {moved.end}")
         taken_ml, end = self._taken_ml, media.end or waste.end
-        row = Ending(on_s, media.high, taken_ml + waste.low, feed_low_ml=media.low).row()
+        row = Ending(on_s, media.high, taken_ml + waste.low, pump=self._number(), feed_low_ml=media.low).row()
         self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=end)
         self._ran_on = self._ran_on or media.high > plan.feed_ml + LATE_ML
         self._fed(media.high, media.low, waste.low)
+
+    def _number(self, job: str = "") -> int:
+        """Return the number of a spare pump, 0 for the feed. Args: job: "" for that of the last dose."""
+        return SPARE * ((job or self._job) == ALT)
 
     def _fed(self, high_ml: float, low_ml: float, taken_ml: float = 0.0) -> None:
         """Count what this dose fed up to now, and what was taken since; little is booked once it is much."""
@@ -195,7 +219,7 @@ class Doses:
         rest_ml = self._now_ml - self._told_ml
         if np.abs(rest_ml).max() > LATE_ML:
             more, less, rise = rest_ml.tolist()
-            self.extra.append(Given(self._book.elapsed(), more, less, more - rise))
+            self.extra.append(Given(self._book.elapsed(), more, less, more - rise, self._number()))
             self._told_ml = self._now_ml
 
     def _drained(self, course: Iterator[float], plan: Plan, name: str) -> Iterator[float]:
@@ -246,7 +270,8 @@ class Doses:
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
             self._give(job, moved.low, moved.high, f"{job} ran without its job")
-        if job == MEDIA:
+        if job != WASTE:
+            self._job = job
             self._ran_on = self._ran_on or moved.high > LATE_ML
             self._told_ml = self._told_ml + np.array([moved.high, moved.low, moved.high])
             self._fed(moved.high, moved.low)
@@ -257,13 +282,13 @@ class Doses:
         What the waste pump took meanwhile is booked with the media: its event may have come, and counted, before.
         """
         beside_ml = (self.pumps.pin(WASTE).ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
-        for job in (MEDIA, WASTE):
+        for job in self.pumps.jobs:
             pin, now = self.pumps.pin(job), self._clock.now()
             if self.pumps.odd(job) or not (pin.on or self.pumps.box.driven(job) or now < pin.off_s + SETTLE_S):
                 ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
                 self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
                 if ran_ml > LATE_ML:
-                    self._theirs(job, ran_ml, "by its pin", beside_ml if job == MEDIA else 0.0)
+                    self._theirs(job, ran_ml, "by its pin", 0.0 if job == WASTE else beside_ml)
 
     def _settle_strange(self) -> None:
         """Book what was dosed without a command of this run, beyond what was counted already."""
@@ -275,7 +300,7 @@ class Doses:
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
             self.pumps.counted[job, source] = counted + over
-            self._strange_ml[job] = self._strange_ml.get(job, 0.0) + over
+            self._strange_ml[job] += over
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
                 continue
@@ -288,7 +313,8 @@ class Doses:
     def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
         """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
         fed = job != WASTE
-        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, beside_ml if fed else high_ml)
+        waste_ml = beside_ml if fed else high_ml
+        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, waste_ml, self._number(job))
         self.extra.append(given)
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
         self._book.log("given", **given.row(why))

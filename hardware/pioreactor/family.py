@@ -16,6 +16,7 @@ from hardware.logbook import Log, no_log
 from hardware.pioreactor.config import FULL_ML, PioreactorConfig, vial_ml
 from hardware.pioreactor.doses import replay
 from hardware.pioreactor.preflight import preflight
+from hardware.pioreactor.pumps import SPARE
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.reactor import Array, Reactor, left_off
 
@@ -28,7 +29,7 @@ class PioreactorFamily(Family):
     """Units of one cluster."""
 
     config = PioreactorConfig
-    can = Can(thermostat=True, regulation=True, resume=True)
+    can = Can(spare_pumps=(SPARE,), thermostat=True, regulation=True, resume=True)
     called = "Pioreactors"
 
     def reached(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> Reached:
@@ -66,6 +67,12 @@ class PioreactorFamily(Family):
         """As `hardware.pioreactor.preflight`. Raises: ReactorError."""
         with self.units(backend, bench, folder) as reactors:
             return preflight(reactors)
+
+    def tube(self, backend: PioreactorConfig, number: int, most_ml: float, who: str) -> None:
+        """By `backend.alt_media`. Raises: UnfitError."""
+        if not backend.alt_media:
+            remedy = "give it one, calibrate it in the vendor's page and set backend.alt_media=true"
+            raise UnfitError(f"{who}: pump {number}, the vendor's alt-media pump, has no tube; {remedy}")
 
     def no_thermostat(self, backend: PioreactorConfig) -> str | None:
         """Name the setting that leaves the vendor's thermostat off; None where the thermostat is on."""

@@ -9,7 +9,7 @@ from hardware.errors import ReactorError
 from hardware.family import Check
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS
-from hardware.pioreactor.pumps import STEP_S, Barrier
+from hardware.pioreactor.pumps import NAMES, STEP_S, Barrier, driven
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import UNHEARD, Station
 from hardware.pioreactor.versions import TESTED, facts
@@ -47,7 +47,8 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     yield Check(f"{name} version", version in TESTED, version, f"tried with {', '.join(TESTED)}{asked}", required=False)
     yield (experiment := _experiment(name, config.experiment, unit.leader))
     calibrations = web.get("/active_calibrations")
-    for pump in ("media_pump", "waste_pump"):
+    names = [NAMES[job] for job in driven(config)]
+    for pump in (f"{name}_pump" for name in names):
         try:
             yield Check(f"{name} {pump}", True, f"{flow(calibrations, pump):.3f} mL/s at its calibrated duty")
         except ReactorError as error:
@@ -63,9 +64,9 @@ def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     remedy = f"allowed backend.channel or backend.units.{name}.channel one of these, or set it in the vendor's page"
     yield Check(f"{name} photodiode", config.channel in eyes, f"{config.channel} of {sees}", remedy)
     wired = {pump: CHANNELS.get(channel) for channel, pump in settings.get("PWM", {}).items()}
-    media, _, waste = config.pump_pins
-    seen = f"media and waste at {wired.get('media')} and {wired.get('waste')}, backend.pump_pins = {media} and {waste}"
-    same = (wired.get("media"), wired.get("waste")) == (media, waste)
+    pins = dict(zip(NAMES.values(), config.pump_pins, strict=True))
+    seen = ", ".join(f"{pump} at {wired.get(pump)} (backend.pump_pins: {pins[pump]})" for pump in names)
+    same = all(wired.get(pump) == pins[pump] for pump in names)
     yield Check(f"{name} wiring", same, seen, "give backend.pump_pins, or correct the section PWM in the vendor's page")
     tube = str(settings.get("bioreactor", {}).get(facts(version).tube, "not set"))
     remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"

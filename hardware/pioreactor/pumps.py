@@ -13,18 +13,36 @@ from typing import Any, NamedTuple, TypeVar
 
 from hardware.clock import Clock
 from hardware.errors import LinkError, ReactorError
+from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import PUMPS, Event, Pin
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
 from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Request", "Seen", "Steps", "boot_of", "is_off"]
+__all__ = [
+    "ALT",
+    "LATE_ML",
+    "MEDIA",
+    "NAMES",
+    "OURS",
+    "SPARE",
+    "WASTE",
+    "Moved",
+    "Pumps",
+    "Request",
+    "Seen",
+    "Steps",
+    "boot_of",
+    "driven",
+    "is_off",
+]
 
 T = TypeVar("T")
 
-MEDIA, WASTE = PUMPS[0], PUMPS[2]
-NAMES = dict(zip(PUMPS, ("media", "alt-media", "waste"), strict=True))
+MEDIA, ALT, WASTE = PUMPS
+NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
+SPARE = 3  # number of the alt-media pump
 OURS = "turbidostat/"
 STEP_S = 0.1
 SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
@@ -115,26 +133,33 @@ class Barrier:
         return self._passed
 
 
+def driven(config: PioreactorConfig) -> tuple[str, ...]:
+    """Return the pump jobs that a run drives."""
+    return PUMPS if config.alt_media else (MEDIA, WASTE)
+
+
 def boot_of(rows: list[dict[str, Any]]) -> str:
     """When a unit was started, by its list of running jobs; "" where that does not say it."""
     return next((str(row.get("started_at", "")) for row in rows if row["job_name"] == "monitor"), "")
 
 
 class Pumps:
-    """Media and waste pump of one unit.
+    """The pumps of one unit.
 
-    Attributes: ours, how every id of this run begins; short, that of a run that only ends with its pin off; flow_ml_s,
-      by the active calibrations; reported, mL by job and source of the events; counted, mL of them that whoever asked
-      for them books, inf while they are under way; facts, of the unit's version; boot, when it was started; proven,
-      when pumps were ended here; trouble, why no dose may be given, "" if one may; cut, whether media is to end,
-      halted, whether everything is; waits, whether what is under way waits for somebody or something else; flowed_ml,
-      the most that a media pump gave up to now that is not proven off, and runs_on, whether it is to be drained.
+    Attributes: jobs, of those that this run drives; ours, how every id of this run begins; short, that of a run that
+      only ends with its pin off; flow_ml_s, by the active calibrations; reported, mL by job and source of the events;
+      counted, mL of them that whoever asked for them books, inf while they are under way; facts, of the unit's version;
+      boot, when it was started; proven, when pumps were ended here; trouble, why no dose may be given, "" if one may;
+      cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for somebody
+      or something else; flowed_ml, the most that a media pump gave up to now that is not proven off, and runs_on,
+      whether it is to be drained.
     """
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.web, self.mqtt, self.box = unit, unit.web, unit.mqtt, unit.box
         self.config, self.clock, self.book = unit.config, unit.real, unit.book
-        self.flow_ml_s = {MEDIA: 1.0, WASTE: 1.0}  # about what the vendor's pumps give, until it was read
+        self.jobs = driven(unit.config)
+        self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # about what the vendor's pumps give, until it was read
         self.reported: dict[tuple[str, str], float] = {}
         self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
@@ -202,7 +227,7 @@ class Pumps:
     def calibrate(self) -> Steps[None]:
         """Read what each pump gives by its calibration now. Raises: ReactorError."""
         said = yield from self.answer(self.web.get, "/active_calibrations")
-        self.flow_ml_s = {MEDIA: flow(said, "media_pump"), WASTE: flow(said, "waste_pump")}
+        self.flow_ml_s = {job: flow(said, f"{NAMES[job]}_pump") for job in self.jobs}
 
     def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
         """Ask for one pump job and follow it; what it gave. It is never asked for again."""
@@ -224,7 +249,7 @@ class Pumps:
         except ReactorError as error:
             self.book.tell(f"{job}: whether it was heard is unknown: {error}")
         moved = yield from self.follow(request)
-        self.counted[job, dose] = moved.high if job == MEDIA else moved.low
+        self.counted[job, dose] = moved.low if job == WASTE else moved.high
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
@@ -234,7 +259,7 @@ class Pumps:
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
         late = self.clock.now() + request.ml / self.flow_ml_s[job] + OVERRUN_S
         while not self._is_over(request):
-            unwanted = self.halted or (self.cut and job == MEDIA)
+            unwanted = self.halted or (self.cut and job != WASTE)
             if unwanted or self.odd(job) or self.broke(request) or self.clock.now() > late:
                 return (yield from self.end(request))
             if job != WASTE and (gave_ml := self._beyond(request)):
@@ -292,7 +317,7 @@ class Pumps:
                 why = f"accepted and not carried out: {self.locks}"
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
-            if (self.halted or (self.cut and job == MEDIA)) and calls.due("stop", 1.0):  # heard once the job listens
+            if (self.halted or (self.cut and job != WASTE)) and calls.due("stop", 1.0):  # heard once the job listens
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late:
@@ -335,12 +360,13 @@ class Pumps:
         job, ending, pin = request.job, ForcedEnd(self, request), self.pin(request.job)
         while math.isnan(off_s := ending.off_s()):
             ending.act()
-            late = self.clock.now() > ending.began + OVERRUN_S
+            late = (now := self.clock.now()) > ending.began + OVERRUN_S
+            heard = self.box.heard_s > max(ending.began, now - QUIET_S)  # else a unit or its broker stands still
             if late:
                 ended = "which lost the broker" if self.broke(request) else "which should have ended"
                 how = "whose process was killed or stands still" if ending.lost else ended
                 off = f"or on the unit: {self.facts.purge} pwm_locks {self.box.jobs[job]} --as-int"
-                if self.told_on(job):
+                if heard and self.told_on(job):
                     self.trouble = f"{self.named(job)} runs on after {job}, {how}; pull its plug, {off}"
                 elif ending.failed:
                     look = "look at it; if it runs, pull its plug"
@@ -349,9 +375,9 @@ class Pumps:
                     self.trouble = f"{self.named(job)} is being verified off after {job}, {how}"
             self.waits = late or self.waits
             if job != WASTE:
-                self.flowed_ml = ending.flowed()
-                now = late or (self.lost(job) and pin.on) or self._beyond(request) > 0.0
-                self.runs_on = self.flowed_ml > 0.0 and now
+                self.flowed_ml = ending.flowed() if heard else 0.0
+                drain = late or (self.lost(job) and pin.on) or self._beyond(request) > 0.0
+                self.runs_on = self.flowed_ml > 0.0 and drain
             yield STEP_S
         self.trouble, self.waits, self.runs_on = "", False, False
         self.proven[job] = self.clock.now()
@@ -407,7 +433,7 @@ class ForcedEnd:
     def act(self) -> None:
         """Ask what is due; a job that is there is given some seconds to end by itself."""
         p, job, passed, calls = self._p, self._job, self._p.clock.now() - self.began, self._calls
-        self._apart_s = self._apart_s if p.mqtt.connected else p.clock.now()
+        self._apart_s = self._apart_s if p.mqtt.connected and not p.told_on(job) else p.clock.now()
         if calls.due("mqtt", 1.0):
             p.unit.say(f"{job}/$state/set", "disconnected")
         if passed > 1.0 and calls.due("pins", 5.0):
@@ -471,14 +497,13 @@ class ForcedEnd:
     def flowed(self) -> float:
         """Return what a pump moved up to now that runs on, or reported a start and no end, mL.
 
-        0 for the pump of a silent unit, and for one whose bottle is empty by now.
+        0 for a pump whose bottle is empty by now.
         """
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
-        silent = self._listed is None or now > self._calls.failed.get("rows", (now, ""))[0] + QUIET_S
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
         flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
-        return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0
+        return flowed if not broke and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
         """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""

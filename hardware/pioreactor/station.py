@@ -12,7 +12,7 @@ from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, History
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import AUTOMATIONS, PUMPS
-from hardware.pioreactor.pumps import MEDIA, STEP_S, UNSTARTED_S, WASTE, Barrier, Calls, Pumps, boot_of
+from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Barrier, Calls, Pumps, boot_of
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import facts
@@ -66,7 +66,7 @@ class Station:
         rows = yield from self._answer(self._web.running)
         self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
         if history.boot not in ("", self._pumps.boot):  # which sets all pins to 0
-            self._pumps.proven = dict.fromkeys((MEDIA, WASTE), self._real.now())
+            self._pumps.proven = dict.fromkeys(self._pumps.jobs, self._real.now())
         if AUTOMATION in self._listed and not self.handed_over:
             raise DeviceStateError("a dosing automation of the vendor's runs, and would dose too; stop it in its page")
         self.doses.restore(history)
@@ -261,7 +261,7 @@ class Station:
 
     # -- commands --------------------------------------------------------------------------------------------------
 
-    def dose(self, rate: float, _pump: int) -> Plan:
+    def dose(self, rate: float, pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
         refusal = ""
         if self.given_up:
@@ -272,7 +272,7 @@ class Station:
             refusal = str(self.book.fault)
         elif self._clock.now() - self.sampling.newest.at > self.unit.bench.stale_s:
             refusal = "its sample is stale"
-        plan = self.doses.begin(rate, self.key, refusal)
+        plan = self.doses.begin(rate, self.key, refusal, pump)
         self.doses.foreign = ""
         return plan
 
@@ -307,10 +307,11 @@ class Station:
         try:
             while (
                 not self._mqtt.connected or self.doses.running or box.on()
-                or any(box.live(job) or pumps.odd(job) for job in (MEDIA, WASTE))
+                or any(box.live(job) or pumps.odd(job) for job in pumps.jobs)
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
-                    on = [pumps.named(job) for job in PUMPS if pumps.told_on(job)]
+                    heard = box.heard_s > self._real.now() - PUMPS_S
+                    on = [pumps.named(job) for job in PUMPS if heard and pumps.told_on(job)]
                     off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
                     seen = f"{on[0]} on; pull its plug" if on else f"not verified off; {off}"
                     why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"

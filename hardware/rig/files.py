@@ -64,13 +64,14 @@ CREATE TABLE experiment_worker_assignments (pioreactor_unit, experiment, assigne
 FOLDERS = (
     "cache", "exports", "experiment_profiles", "exportable_datasets", "plugins", "ui/automations/dosing",
     "ui/automations/led", "ui/automations/temperature", "ui/charts", "ui/jobs", "ui/settings", "hardware/hats/1.2",
-    "storage/calibrations/media_pump", "storage/calibrations/waste_pump",
+    *(f"storage/calibrations/{pump}_pump" for pump in ("media", "alt_media", "waste")),
 )  # fmt: skip
 
 
 def flows(k: int) -> dict[str, float]:
     """mL/s of the pumps of the k-th unit: no two are alike; the tubes of the second give the same."""
-    return {"media_pump": (1.0, 0.8, 1.25)[k % 3], "waste_pump": (2.0, 0.8, 1.9)[k % 3]}
+    flow = {"media_pump": (1.0, 0.8, 1.25), "alt_media_pump": (0.9, 0.8, 1.1), "waste_pump": (2.0, 0.8, 1.9)}
+    return {pump: ml_s[k % 3] for pump, ml_s in flow.items()}
 
 
 def model(volume_ml: float) -> str:

@@ -17,12 +17,13 @@ from conf.presets import load
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from hardware.pioreactor.config import vial_ml
-from hardware.rig.files import PINS
+from hardware.rig.files import PINS, flows
 
 __all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
 
 VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with the reference at 0.1 V one unit of the reading is one OD
-MEDIA, WASTE = PINS["media"], PINS["waste"]  # a chip drives them on when the process that set them is killed
+PUMPS = {PINS[pump]: pump for pump in ("media", "alt_media", "waste")}  # a pin stays on when its process is killed
+MEDIA, ALT, WASTE = PUMPS
 HEATER = PINS["heating"]  # its process drives it
 VIAL_C, PLATE_C = 0.8, 0.48  # degC per percent of the heater's duty: vial above the room, plate above the vial
 PLATE_S = 70.0  # in which the plate follows: the vendor's estimate from its cooling is then the vial's within 0.4 degC
@@ -30,7 +31,7 @@ PLATE_S = 70.0  # in which the plate follows: the vendor's estimate from its coo
 
 @dataclass(frozen=True)
 class Pulse:
-    """One run of a pump: where, when (s since 1970), how long, and the fresh medium it moved."""
+    """One run of a pump: where, when (s since 1970), how long, and the fresh fluid it moved."""
 
     unit: str
     pump: str
@@ -52,7 +53,7 @@ def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float
 
 
 class _Vial:
-    """One culture with its two pumps and its heater, in real seconds; growth alone runs `growth_x` times faster.
+    """One culture with its pumps and its heater, in real seconds; growth alone runs `growth_x` times faster.
 
     It stays at its temperature until the heater is first driven, and then at what the heater makes of it.
 
@@ -60,10 +61,11 @@ class _Vial:
       heat, duty of the heater, nan before that; plate_c, by how much its plate is warmer than the vial.
     """
 
-    def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any) -> None:
+    def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any, alt_ml_s: float = 0.0) -> None:
+        self._alt_ml_s, self.alt_ml = alt_ml_s, 0.0
         self.unit, self.plant, self._growth_x, self._log = unit, plant, growth_x, log
         self.at = time.time()
-        self.duty = {MEDIA: 0.0, WASTE: 0.0}
+        self.duty = dict.fromkeys(PUMPS, 0.0)
         self._since: dict[int, tuple[float, float]] = {}
         self.pulses: list[Pulse] = []
         self.peak_ml = float(plant.vessel.volume_ml[0])
@@ -81,9 +83,11 @@ class _Vial:
         seconds = now - self.at
         if seconds <= 1e-4:
             return
-        on = {pin: np.array([self.duty[pin] / 100.0 * seconds]) for pin in (MEDIA, WASTE)}
+        on = {pin: np.array([duty / 100.0 * seconds]) for pin, duty in self.duty.items()}
         minutes, thermal = seconds * self._growth_x / 60.0, self.plant.thermal
-        self.plant.advance(minutes, on[MEDIA], on[WASTE])
+        alt_ml = on[ALT] * self._alt_ml_s
+        self.plant.advance(minutes, on[MEDIA], on[WASTE], supply_ml=alt_ml)
+        self.alt_ml += float(alt_ml[0])
         if self.heat >= 0.0:
             self.heat *= self.heat == 0.0 or _alive(self._heated_by)
             thermal.temperature = thermal.temperature + VIAL_C * self.heat * minutes / thermal.config.cooling_min
@@ -99,14 +103,15 @@ class _Vial:
             self.plant.thermal.set_target(0.0)
         if pin not in self.duty:
             return
-        was, fed = self.duty[pin], float(self.plant.feed.delivered_ml[0])
+        was = self.duty[pin]
+        fed = {MEDIA: float(self.plant.feed.delivered_ml[0]), ALT: self.alt_ml, WASTE: 0.0}[pin]
         if duty > 0.0 and was == 0.0:
             self._since[pin] = (now, fed)
         if duty == 0.0 and was > 0.0:
             start, had = self._since.pop(pin)
-            pump, ml = ("media", fed - had) if pin == MEDIA else ("waste", 0.0)
-            self.pulses.append(Pulse(self.unit, pump, start, now - start, ml))
-            self._log({"unit": self.unit, "pump": pump, "start": start, "s": now - start, "ml": ml})
+            run = Pulse(self.unit, PUMPS[pin], start, now - start, fed - had)
+            self.pulses.append(run)
+            self._log({"unit": self.unit, "pump": run.pump, "start": start, "s": run.seconds, "ml": run.feed_ml})
         self.duty[pin] = duty
 
     def truth(self) -> dict[str, Any]:
@@ -116,6 +121,7 @@ class _Vial:
             "volume_ml": float(self.plant.vessel.volume_ml[0]),
             "peak_ml": self.peak_ml,
             "fed_ml": float(self.plant.feed.delivered_ml[0]),
+            "alt_ml": self.alt_ml,
             "duty": {str(pin): duty for pin, duty in self.duty.items()},
             "temperature": float(self.plant.thermal.temperature[0]),
         }
@@ -133,7 +139,10 @@ class VialServer:
     def __init__(self, plants: Mapping[str, PlantConfig], growth_x: float, folder: Path, seed: int = 0) -> None:
         self._file = (folder / "truth.jsonl").open("a", encoding="utf-8", buffering=1)
         streams = iter(np.random.default_rng(seed).spawn(len(plants)))
-        self.vials = {u: _Vial(u, Plant(plant, 1, [next(streams)]), growth_x, self._log) for u, plant in plants.items()}
+        self.vials = {
+            unit: _Vial(unit, Plant(plant, 1, [next(streams)]), growth_x, self._log, flows(k)["alt_media_pump"])
+            for k, (unit, plant) in enumerate(plants.items())
+        }
         self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._wire.bind(("127.0.0.1", 0))
         self._wire.settimeout(0.05)
@@ -183,7 +192,7 @@ class VialServer:
     def power_cut(self, unit: str) -> None:
         """Every pin of a unit falls to 0."""
         with self._lock:
-            for pin in (MEDIA, WASTE):
+            for pin in self.vials[unit].duty:
                 self.vials[unit].drive(pin, 0.0, 0, time.time())
 
     def close(self) -> None:

@@ -20,13 +20,16 @@ from experiments.loop.loop import ClosedLoop
 from experiments.loop.signals import Findings
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.chibio.dosing import SupplyConfig
+from hardware.family import family_of
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.doses import replay
 from hardware.reactor import Command, Receipt
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.extensions.drug import Drug, StressConfig
 from tests.hardware.emulator_lab import BIAS_S, quiet
+from tests.hardware.pioreactor_lab import Lab
 
 HOUR = Scenario((0.45,), (60.0,), (37.0,))
 SOON = StressConfig(growth=0.012, gain=0.03, most=0.007, memory=3.0)
@@ -104,6 +107,42 @@ def test_a_resumed_run_gives_the_drug_that_one_without_a_pause_gives() -> None:
     assert (pumps[:, 0] != pumps[:, 1]).any()
 
 
+def test_a_drug_on_the_alt_media_pump_of_a_pioreactor_goes_on_after_a_kill_in_its_dose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its OD stands at .5, so what is fed is taken for growth, which the drug answers."""
+    first = Lab(monkeypatch, alt_media=True)
+    world, config = first.world, first.reactors.config
+    first.begin()
+
+    def looped(lab: Lab) -> ClosedLoop:
+        law = registry.build(registry.config("inverse"), model=EnvConfig())
+        drug = Drug(replace(SOON, growth=0.002), [HOUR])
+        actuators = family_of(config).actuators(config)
+        return ClosedLoop(lab.reactors, law, Interlock(1), [HOUR], further=(drug,), actuators=actuators)
+
+    loop = looped(first)
+    while not first.asked("add_alt_media"):
+        loop.step()
+    rows, state = list(first.rows), json.loads(json.dumps(loop.state()))
+    assert replay(rows)["pio01"].open
+    world.box = None
+    world.sleep(0.4)
+    again = Lab(monkeypatch, world, alt_media=True)
+    again.rows = rows
+    again.begin(replay(rows)["pio01"], rows[-1]["time_s"] + 0.4)
+    loop = looped(again)
+    loop.restore(state)
+    pumps = [step.pump[0] for _ in range(25) if (step := loop.step()) is not None]
+    again.reactors.stop()
+    assert set(pumps) == {1, 3}
+    ids = [options["source-of-event"] for options in again.asked("add_alt_media")]
+    assert len(ids) == len(set(ids)) > 3
+    fed_ml = world.truth["add_media"] + world.truth["add_alt_media"]
+    assert float(loop.interlock.budget.fed_ml[0]) == pytest.approx(fed_ml, abs=0.3)
+    assert not world.since
+
+
 class Lamp:
     """Asks for 140 % and for 30 %; an integral that nobody gets."""
 
@@ -175,7 +214,14 @@ def test_a_signal_without_a_part_is_refused() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"backend": PioreactorConfig(reactors=("M0",))}, "drug acts by the pump 3: these reactors have feed pump"),
+        (
+            {"backend": PioreactorConfig(reactors=("M0",))},
+            "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube",
+        ),
+        (
+            {"backend": PioreactorConfig(reactors=("M0",)), "signals": {"drug": replace(SOON, pump="pump 4")}},
+            "drug acts by the pump 4: these reactors have feed pump",
+        ),
         ({"signals": {"drug": replace(SOON, pump="pump 4")}}, "signals.drug of M0: Pump4 has no tube"),
         ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* beside signals.drug"),
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),

@@ -28,9 +28,9 @@ from hardware.reactor import Command, Measurement
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import SafetyConfig
 
-UNIT, EXPERIMENT, MEDIA_PIN, WASTE_PIN = "pio01", "turbidostat", 13, 12
-PINS = {"add_media": MEDIA_PIN, "remove_waste": WASTE_PIN}
-FLOW = {"add_media": 0.7, "remove_waste": 1.6}  # mL/s
+UNIT, EXPERIMENT, MEDIA_PIN, ALT_PIN, WASTE_PIN = "pio01", "turbidostat", 13, 16, 12
+PINS = {"add_media": MEDIA_PIN, "add_alt_media": ALT_PIN, "remove_waste": WASTE_PIN}
+FLOW = {"add_media": 0.7, "add_alt_media": 0.5, "remove_waste": 1.6}  # mL/s
 BEGIN_S = 0.25  # from the answer 202 to the pin
 STIR_S, OD_S = 26.0, 5.0
 TUBE_ML, RIM_ML = 20.0, 40.0  # of the vial
@@ -142,7 +142,7 @@ class World(VirtualClock):
 
     def pin(self, job: str, on: bool, told: bool = True) -> None:
         """A pin really goes on or off."""
-        number, flows = PINS[job], {MEDIA_PIN: FLOW["add_media"], WASTE_PIN: -FLOW["remove_waste"]}
+        number, flows = PINS[job], {PINS[j]: ml_s if j != "remove_waste" else -ml_s for j, ml_s in FLOW.items()}
         rise_ml = sum(flows[pin] for pin in self.since) * (self.now() - self._level_s)
         self.level_ml, self._level_s = min(max(self.level_ml + rise_ml, TUBE_ML), RIM_ML), self.now()
         if on:
@@ -391,7 +391,7 @@ class FakeWeb:
         self.world, self.url, self._count = world, "http://pio01.local", itertools.count()
         poly: Any = {"type": "poly", "coefficients": [0.0, 0.0]}
         self.active: dict[str, Any] = {}
-        for job, pump in (("add_media", "media_pump"), ("remove_waste", "waste_pump")):
+        for job, pump in zip(FLOW, ("media_pump", "alt_media_pump", "waste_pump"), strict=True):
             line = [FLOW[job], 0.0]
             curve = line if world.version < "26" else {**poly, "coefficients": line}
             self.active[pump] = {"curve_data_": curve}
@@ -548,11 +548,11 @@ class Lab:
                 return m
         raise AssertionError(f"no sample in {tries} looks: {m.vitals}")
 
-    def dose(self, ml: float) -> float:
+    def dose(self, ml: float, pump: int = 1) -> float:
         """Ask for this volume; what the receipt says."""
         rate = np.array([ml / self.bench.period_s])
         rows, nothing = np.array([True]), np.array([np.nan])
-        self.receipt = self.reactors.actuate(Command(rows, rate, nothing))
+        self.receipt = self.reactors.actuate(Command(rows, rate, nothing, pump=np.array([pump])))
         return float(self.receipt.volume_ml[0])
 
     def wait(self, seconds: float) -> None:

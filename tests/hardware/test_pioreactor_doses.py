@@ -12,7 +12,7 @@ from hardware.pioreactor.pumps import LATE_ML
 from hardware.pioreactor.versions import TESTED
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal
-from tests.hardware.pioreactor_lab import FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
+from tests.hardware.pioreactor_lab import ALT_PIN, FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
 
 
 @pytest.fixture
@@ -509,3 +509,72 @@ def test_after_a_crash_a_pump_that_cannot_be_proven_off_is_told_after_a_while(mo
     again.until(lambda: seen.append(str(again.fault)) or "may run on" in seen[-1], 60.0)
     told = list(dict.fromkeys(line for line in seen if "the media pump (pin 13)" in line or "plug" in line))
     assert ["plug" in line for line in told] == [False, True]
+
+
+# -- a second fluid ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(monkeypatch):
+    made = Lab(monkeypatch, alt_media=True)
+    made.begin()
+    made.sample()
+    return made
+
+
+def test_a_dose_of_the_alt_media_pump_is_followed_booked_as_pump_3_and_wasted_as_one_of_media(two):
+    assert two.dose(0.04) == 0.0
+    two.sample()
+    assert two.dose(0.9, pump=3) == pytest.approx(0.9)
+    assert two.receipt.kept_ml[0] == 0.0, "what the feed has put off stays"
+    two.wait(8.0)
+    assert [len(two.asked(job)) for job in ("add_media", "add_alt_media", "remove_waste")] == [0, 1, 1]
+    assert two.world.truth["add_alt_media"] == pytest.approx(0.9, abs=0.02)
+    assert two.world.truth["remove_waste"] == pytest.approx(1.8, abs=0.02)
+    assert [(row.pump, row.feed_ml) for row in dosed(two.rows)] == [(3, pytest.approx(0.9, abs=0.02))]
+    two.sample()
+    assert two.dose(0.3) == pytest.approx(0.34)
+
+
+@pytest.mark.parametrize("away_s", [0.2, 30.0])
+def test_a_dose_of_the_alt_media_pump_in_which_the_program_is_killed_is_booked_and_not_sent_again(
+    monkeypatch, two, away_s
+):
+    two.dose(0.9, pump=3)
+    two.until(lambda: ALT_PIN in two.world.since, 10.0)
+    rows, world = list(two.rows), two.world
+    world.box = None
+    world.sleep(away_s)
+    again = Lab(monkeypatch, world, alt_media=True)
+    again.rows = rows
+    again.begin(replay(rows)[UNIT], 60.0 + away_s)
+    again.until(lambda: not again.station.doses.running, 60.0)
+    low, high = again.given()
+    assert low <= world.truth["add_alt_media"] <= high + 0.02
+    assert {row.pump for row in dosed(again.rows)} == {3}
+    assert (len(again.asked("add_alt_media")), world.truth["add_media"]) == (1, 0.0)
+    again.sample()
+    assert again.dose(0.7) == pytest.approx(0.7)
+
+
+def test_an_alt_media_pump_that_stands_on_is_drained_proven_off_and_booked_as_pump_3(two):
+    two.world.strikes, two.world.freeze_after_s, two.world.frozen_s = "add_alt_media", 0.6, 20.0
+    planned = two.dose(0.9, pump=3)
+    two.until(lambda: "the alt_media pump (pin 16) runs on" in str(two.fault), 20.0)
+    two.until(lambda: two.fault is None and not two.station.doses.running, 100.0)
+    assert two.world.truth["remove_waste"] >= two.world.truth["add_alt_media"] - 0.1
+    extra = two.reactors.repeated()
+    assert {receipt.pump for _, receipt in extra} == {3}
+    booked = planned + sum(float(receipt.volume_ml[0]) for _, receipt in extra)
+    assert two.given()[0] <= two.world.truth["add_alt_media"] <= booked + LATE_ML
+
+
+@pytest.mark.parametrize("lacks", ["alt_media_pump", ""])
+def test_a_run_with_alt_media_needs_a_calibration_of_its_pump(monkeypatch, lacks):
+    lab = Lab(monkeypatch, alt_media=bool(lacks))
+    lab.web.active.pop("alt_media_pump")
+    if not lacks:
+        lab.begin()
+        return
+    with pytest.raises(DeviceStateError, match="calibration of the alt_media_pump"):
+        lab.begin()
