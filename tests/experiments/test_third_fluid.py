@@ -29,7 +29,7 @@ from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.extensions.drug import Drug, StressConfig
 from tests.hardware.emulator_lab import BIAS_S, quiet
-from tests.hardware.pioreactor_lab import Lab
+from tests.hardware.pioreactor_lab import ALT_PIN, Lab
 
 HOUR = Scenario((0.45,), (60.0,), (37.0,))
 SOON = StressConfig(growth=0.012, gain=0.03, most=0.007, memory=3.0)
@@ -110,36 +110,48 @@ def test_a_resumed_run_gives_the_drug_that_one_without_a_pause_gives() -> None:
 def test_a_drug_on_the_alt_media_pump_of_a_pioreactor_goes_on_after_a_kill_in_its_dose(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its OD stands at .5, so what is fed is taken for growth, which the drug answers."""
-    first = Lab(monkeypatch, alt_media=True)
+    first = Lab(monkeypatch, alt_media=True, speed=5.0, reading_s=1.0)
     world, config = first.world, first.reactors.config
+    world.od_s = 1.0
     first.begin()
 
     def looped(lab: Lab) -> ClosedLoop:
         law = registry.build(registry.config("inverse"), model=EnvConfig())
-        drug = Drug(replace(SOON, growth=0.002), [HOUR])
+        drug = Drug(replace(SOON, memory=1.0), [HOUR])
         actuators = family_of(config).actuators(config)
         return ClosedLoop(lab.reactors, law, Interlock(1), [HOUR], further=(drug,), actuators=actuators)
 
+    def step(loop: ClosedLoop) -> Any:
+        """A culture that grows by .025/min, diluted by both fluids."""
+        fed_ml = world.truth["add_media"] + world.truth["add_alt_media"]
+        minutes = 5.0 * (world.now() - 1000.0) / 60.0
+        world.reading = 0.5 * float(np.exp(0.025 * minutes - fed_ml / 20.0))
+        return loop.step()
+
     loop = looped(first)
-    while not first.asked("add_alt_media"):
-        loop.step()
+    while step(loop).pump[0] != 3:
+        assert world.now() < 2000.0
+    first.until(lambda: ALT_PIN in world.since, 10.0)
     rows, state = list(first.rows), json.loads(json.dumps(loop.state()))
-    assert replay(rows)["pio01"].open
+    assert (replay(rows)["pio01"].open, replay(rows)["pio01"].pump) == (True, 3)
     world.box = None
     world.sleep(0.4)
-    again = Lab(monkeypatch, world, alt_media=True)
+    again = Lab(monkeypatch, world, alt_media=True, speed=5.0, reading_s=1.0)
     again.rows = rows
-    again.begin(replay(rows)["pio01"], rows[-1]["time_s"] + 0.4)
+    again.begin(replay(rows)["pio01"], rows[-1]["time_s"] + 2.0)
     loop = looped(again)
     loop.restore(state)
-    pumps = [step.pump[0] for _ in range(25) if (step := loop.step()) is not None]
+    pumps = [done.pump[0] for _ in range(12) if (done := step(loop)) is not None]
+    again.until(lambda: not again.station.doses.running, 30.0)
     again.reactors.stop()
+    again.book(loop.interlock.budget)
     assert set(pumps) == {1, 3}
     ids = [options["source-of-event"] for options in again.asked("add_alt_media")]
-    assert len(ids) == len(set(ids)) > 3
+    assert len(ids) == len(set(ids)) > 2
     fed_ml = world.truth["add_media"] + world.truth["add_alt_media"]
-    assert float(loop.interlock.budget.fed_ml[0]) == pytest.approx(fed_ml, abs=0.3)
+    low, high = again.given()
+    assert low - 0.1 <= fed_ml <= high + 0.1
+    assert float(loop.interlock.budget.fed_ml[0]) == pytest.approx(high, abs=0.1)
     assert not world.since
 
 
