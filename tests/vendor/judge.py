@@ -51,6 +51,12 @@ class Record:
         """mL by the recording."""
         return sum(float(row["volume_ml"] or 0.0) for row in self.rows(m))
 
+    def least(self, m: str) -> float:
+        """Return what was given at least: mL by the recording, less what the journal leaves open."""
+        ends = {round(row["on_s"], 3): row for row in self.of("dose_end", m)}.values()
+        doubt = sum(row["feed_ml"] + row["repeated_ml"] - row["feed_low_ml"] for row in ends)
+        return self.booked(m) - doubt - sum(row["feed_ml"] - row["feed_low_ml"] for row in self.of("given", m))
+
     def lost_and_doubled(self, m: str) -> tuple[int, int]:
         """Samples of the journal that have no row in the recording; rows beyond one a sample."""
         samples = [row["sample"] for row in self.of("sample", m)]

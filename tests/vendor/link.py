@@ -21,8 +21,8 @@ class Rule:
     """What befalls requests whose "METHOD /path" matches. Times in device seconds.
 
     before: wait before the device hears it; after: before the client hears the answer; times: how often, None for
-    always; swallow: answered 204, never heard by the device; then: called when the device has answered and the client
-    does not know yet, `ahead` before the device hears it.
+    always; swallow: answered 204, never heard by the device; keeps: each answer is that to the first; then: called when
+    the device has answered and the client does not know yet, `ahead` before the device hears it.
     """
 
     pattern: str
@@ -30,6 +30,8 @@ class Rule:
     after: float = 0.0
     times: int | None = None
     swallow: bool = False
+    keeps: bool = False
+    kept: bytes = b""
     ahead: Callable[[], None] | None = None
     then: Callable[[], None] | None = None
 
@@ -131,7 +133,10 @@ class Link:
             self._wait(rule.before)
         if self._lost(client, epoch):
             return False
-        answer = ANSWER if any(rule.swallow for rule in rules) else self._forward(head)
+        kept = next((rule.kept for rule in rules if rule.kept), b"")
+        answer = ANSWER if any(rule.swallow for rule in rules) else kept or self._forward(head)
+        for rule in rules:
+            rule.kept = answer if rule.keeps else b""
         for rule in rules:
             self._wait(rule.after)
             if rule.then:
