@@ -42,7 +42,8 @@ def diagnose(
     handed_over = math.isfinite(setpoint)
     on = config.overflow_pump.others_on(state)
     if on and not dosing and not handed_over:
-        return Fault("pump", f"pumps on: {on}, and no dose has them", "close the device's web page everywhere")
+        page = "close the device's web page everywhere; look for a proxy that repeats requests"
+        return Fault("pump", f"pumps on: {on}, and no dose has them", page)
     if state.pumping_modes or (not regulates(state, setpoint) if handed_over else state.regulating):
         what = ", ".join(state.pumping_modes) or describe(state)
         return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")

@@ -25,6 +25,12 @@ WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste m
 LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then
 REFUSALS = 4  # of pumps that should be off, in a row, until the experiment is ended
 SLOW_S = 1.0  # an answer to a pump command that takes longer is told
+AGAIN = "it ran again, as a command was repeated or late on the way, or another program gave one"
+
+
+def _change(before: float, now: float) -> str:
+    """Say how a target was changed; "" if it is the same."""
+    return "" if abs(now - before) <= SAME_S / PERIOD_S else f"its target was changed from {before:.4g} to {now:.4g}"
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class DoseSequence:
         self._due_s = math.inf  # clock time at which the dose under way should be over
         self._given_up: dict[str, float] = {}  # pumps whose command brought no answer and may yet be carried out, since
         self.stray_s = -math.inf
-        self._strays: dict[str, tuple[float, float, float]] = {}  # pumps that no dose has: off until, seen on, target
+        self._strays: dict[str, tuple[str, float, float, float]] = {}  # pumps that no dose has, as `_book_stray`
         self._targets: dict[str, float] = {}  # of feed pumps, as last seen
         self._quiet_s = 0.0  # run time at which no pump was on that no dose has
         self._undrained = False
@@ -263,8 +269,8 @@ class DoseSequence:
         self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
         if (known := self._past()).open:
             self._conclude(known)
-        for pump, (off_s, seen_s, target) in self._strays.items():
-            self._book_stray(pump, target, off_s, seen_s)
+        for pump, stray in self._strays.items():
+            self._book_stray(pump, *stray)
         self._strays.clear()
         self._quiet_s = self._book.elapsed()
 
@@ -298,13 +304,13 @@ class DoseSequence:
             self._targets.clear()
         for pump in (FEED, *self._config.supply.pumps):
             target, before = state.pump_targets[PUMPS.index(pump)], self._targets.get(pump, math.nan)
-            self._targets[pump] = target
+            self._targets[pump], change = target, "" if math.isnan(before) else _change(before, target)
             if not ours or (known.open and pump == known.feed_pump):
                 continue
             if pump in state.running_pumps:
-                self._strays.setdefault(pump, (self._quiet_s, now, target))
-            elif pump not in self._strays and abs(target - before) > 1e-5:
-                self._book_stray(pump, target, self._quiet_s, math.nan)
+                self._strays.setdefault(pump, (change or AGAIN, target, self._quiet_s, now))
+            elif pump not in self._strays and change:
+                self._book_stray(pump, change, target, self._quiet_s, math.nan)
         if self._strays:
             self.stray_s = self._clock.now()
         else:
@@ -327,10 +333,13 @@ class DoseSequence:
             self._book.tell(f"the board agent switched off in a dose: {', '.join(stopped)}")
         if known.experiment not in ("", state.start_time):
             self._book.tell("the device was restarted in a dose, which ended it")
-        if added := found(known, state, now, now if math.isnan(seen_s) else seen_s, self._config.deadman_s, stopped):
+        seen_s, silence_s = now if math.isnan(seen_s) else seen_s, self._config.deadman_s
+        if added := found(known, state, now, seen_s, silence_s, stopped, killed=not self.running):
             self._book.log("found", **added)
-            if {"feed_anew", "waste_anew"} & added.keys():
-                self._book.tell("a pump was found with another target, or on again, in a dose: was the web page used?")
+        for part, pump, set_s in (("feed", known.feed_pump, known.feed_s), ("waste", WASTE, known.waste_s)):
+            if f"{part}_anew" in added:
+                change = _change(set_s / PERIOD_S, state.pump_targets[PUMPS.index(pump)])
+                self._book.tell(f"{pump} in a dose: {change or AGAIN}")
 
     def _conclude(self, known: ReactorHistory) -> None:
         """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
@@ -347,10 +356,10 @@ class DoseSequence:
         if known.fed and math.isnan(known.feed_on[1]):
             self._given_up[known.feed_pump] = known.on_s
 
-    def _book_stray(self, pump: str, target: float, off_s: float, seen_s: float) -> None:
+    def _book_stray(self, pump: str, cause: str, target: float, off_s: float, seen_s: float) -> None:
         """Book what a pump gave that no dose had. Args: it was off at off_s, and seen on at seen_s, nan if never."""
         self.stray_s = self._clock.now()
-        known, late = self._past(), self._may_be_late(pump)
+        known = self._past()
         dose_s = PERIOD_S * target if target > 0.0 else 0.0
         if known.feed_pump == pump and abs(dose_s - known.feed_s) <= SAME_S:
             seen_s = math.nan  # an old answer, delivered again, looks the same
@@ -359,17 +368,14 @@ class DoseSequence:
             feed_on=(off_s, seen_s), feed_off=NEVER, feed_anew=NEVER,
         )  # fmt: skip
         ending, _ = conclude(other, self._book.elapsed(), self._calibrated(pump), self._calibration.waste)
-        why = f"{pump} was used by somebody, at a target of {target:g}"
-        if late:
-            why = "a feed command that was given up was heard late"
-            self._given_up.pop(pump)
+        self._given_up.pop(pump, None)
         state = self._connection.state
         alone = state is None or not (state.regulating or state.pumping_modes)  # else the waste pump has run beside it
         given = [replace(one, waste_ml=one.waste_ml * (not alone)) for one in ending.beyond(0.0)]
         for one in given:
-            self._book.log("given", **one.row("heard late" if late else "by somebody"))
+            self._book.log("given", **one.row("without a dose"))
         total_ml, low_ml = sum(one.feed_ml for one in given), sum(one.low_ml for one in given)
-        self._book.tell(f"{why}: {low_ml:.2f} to {total_ml:.2f} mL, booked as the latter")
+        self._book.tell(f"{pump} gave {low_ml:.2f} to {total_ml:.2f} mL without a dose, booked as the latter: {cause}")
         self.extra += given
         self._undrained = self._undrained or (alone and bool(given))
 

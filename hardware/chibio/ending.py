@@ -20,6 +20,17 @@ SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last reque
 SAME_S = 1e-3  # on-times that differ by less are one target: a path carries six digits of it
 MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer
 
+OFF = (  # what speaks for a pump that is found off, and the two times between which it went off: the first row decides
+    ("the device was restarted", "last answer", "now"),
+    ("an agent says when", "agent", "agent"),
+    ("an agent that does not say had the time", "on", "silence"),
+    ("it was asked off without an answer", "tried", "now"),  # done at once, or when a tunnel delivered it
+    ("the experiment was ended", "last answer", "now"),
+    ("its program was killed, and its waste pump is on", "end", "end"),  # by that program; an agent ends both
+    ("it was not heard to go on", "asked", "asked"),  # and never did
+    ("nothing", "on", "now"),  # somebody switched it off
+)
+
 
 @dataclass(frozen=True)
 class _Pump:
@@ -54,35 +65,31 @@ def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
     """Feed and waste of an open dose."""
     fed_s = known.on_s if known.fed else math.inf
     wasted_s = known.on_s if math.isnan(known.waste_on[0]) else known.waste_on[0]
+    feed, waste = (
+        tuple(getattr(known, f"{part}_{what}") for what in ("on", "off", "tried", "s", "anew"))
+        for part in ("feed", "waste")
+    )
     return (
-        _Pump(
-            "feed", known.feed_pump, fed_s, known.feed_on, known.feed_off, known.feed_tried, known.feed_s,
-            known.feed_anew,
-        ),
-        _Pump(
-            "waste", WASTE, wasted_s if known.wasted else math.inf, known.waste_on, known.waste_off,
-            known.waste_tried, known.waste_s, known.waste_anew,
-        ),
-    )  # fmt: skip
+        _Pump("feed", known.feed_pump, fed_s, *feed),
+        _Pump("waste", WASTE, wasted_s if known.wasted else math.inf, *waste),
+    )
 
 
 def found(
     known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float, silence_s: float,
-    stopped: Mapping[str, float] | None,
+    stopped: Mapping[str, float] | None, killed: bool = False,
 ) -> dict[str, Span | None]:  # fmt: skip
     """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
 
     None takes back what was answered and is not so; then it may be on anew, or the look may be an old answer delivered
     again, so what was answered stays the least. So it is where another target is found than was set. Nothing is added
-    where the answers have told it. A pump that is found off was switched off by whom and when, in this order: by a
-    restart; by the agent, as it says; by a command of ours whose answer was lost, done at once or when a tunnel
-    delivered it; by the end of its experiment; else it never went on, or somebody, or an agent that cannot be asked,
-    switched it off.
+    where the answers have told it. Of a pump that is found off `OFF` says when it went off.
 
     Args:
       state: as read at run time now_s. seen_s: run time of the last answer before that.
       silence_s: of this program, after which a board agent, if there is one, switches pumps off.
       stopped: pump, run time at which an agent says that it found it on and switched it off; None: it does not say.
+      killed: an earlier life of the program left the dose open, and what it sent last is not on record.
     """
     added: dict[str, Span | None] = {}
     restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)
@@ -90,7 +97,6 @@ def found(
         is_on, asked_s = state.pumps_on[PUMPS.index(pump.name)] and not restarted, min(pump.asked_s, known.on_s)
         on_heard, off_heard = not math.isnan(pump.on[1]), not math.isnan(pump.off[1])
         agent_s = (stopped or {}).get(pump.name, math.nan)
-        silent = stopped is None and now_s >= seen_s + silence_s
         if (is_on or not math.isnan(agent_s)) and not on_heard:
             heard_s = now_s if is_on else agent_s - silence_s + SWITCH_S  # an agent waits from the last request on
             added[f"{pump.part}_on"] = (asked_s, min(max(asked_s, heard_s), now_s))
@@ -104,22 +110,19 @@ def found(
             added[f"{pump.part}_anew"] = pump.off[0], pump.dose_s
         if is_on or off_heard:
             continue
-        if restarted:  # at some time since it was last heard, and until then it may have repeated the dose
-            off = min(seen_s, now_s), now_s
-        elif not math.isnan(agent_s):
-            off = agent_s, agent_s
-        elif not math.isnan(pump.tried_s) and not silent:
-            off = min(pump.tried_s, now_s), now_s
-        elif not state.running:
-            off = min(seen_s, now_s), now_s
-        elif on_heard and pump.part == "feed" and seen_s < now_s and state.pumps_on[PUMPS.index(WASTE)]:
-            off = pump.on[1] + pump.dose_s + MOTOR_S, pump.on[1] + pump.dose_s + MOTOR_S  # an agent ends both
-        elif not on_heard and not silent:
-            off = asked_s, asked_s
-        else:
-            heard_s = pump.on[1] if on_heard else asked_s
-            off = heard_s, max(heard_s, min(now_s, seen_s + silence_s + SWITCH_S) if stopped is None else now_s)
-        added[f"{pump.part}_off"] = off
+        on_s = pump.on[1] if on_heard else asked_s
+        at_s = {
+            "now": now_s, "last answer": min(seen_s, now_s), "agent": agent_s, "tried": min(pump.tried_s, now_s),
+            "asked": asked_s, "on": on_s, "end": on_s + pump.dose_s + MOTOR_S,
+            "silence": max(on_s, min(now_s, seen_s + silence_s + SWITCH_S)),
+        }  # fmt: skip
+        waste_left = killed and pump.part == "feed" and state.pumps_on[PUMPS.index(WASTE)]
+        speaks = (
+            restarted, not math.isnan(agent_s), stopped is None and now_s >= seen_s + silence_s,
+            not math.isnan(pump.tried_s), not state.running, on_heard and waste_left, not on_heard, True,
+        )  # fmt: skip
+        _, since, until = OFF[speaks.index(True)]
+        added[f"{pump.part}_off"] = at_s[since], at_s[until]
     return added
 
 
@@ -144,7 +147,7 @@ def conclude(
         known.on_s, feed_ml, waste_ml, feed_times, waste_times, number, feed_last_ml, waste_last_ml,
         low_ml * max(low_times, 1) + low_last_ml,
     )  # fmt: skip
-    return ending, _words(ending, known.feed_ml)
+    return ending, _words(ending, known)
 
 
 def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) -> tuple[float, int, float]:
@@ -154,13 +157,13 @@ def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) ->
     return pump.volume(min(dose_s, on_s)), times, last_ml
 
 
-def _words(ending: Ending, planned_ml: float) -> str:
+def _words(ending: Ending, known: ReactorHistory) -> str:
     """Say what is not as planned."""
     low_ml, most_ml, times = ending.feed_low_ml, ending.feed_ml + ending.repeated_ml, ending.feed_times
-    dose, volume = f"a dose of {planned_ml:.2f} mL", f"{low_ml:.2f} to {most_ml:.2f} mL"
-    if times:
+    dose, volume = f"a dose of {known.feed_ml:.2f} mL", f"{low_ml:.2f} to {most_ml:.2f} mL"
+    if times and math.isnan(known.feed_anew[0]):
         return f"{dose} was repeated up to {times} times by the device, {volume} in all, booked at their times"
     if most_ml < 1e-3:
         return f"{dose} gave no medium"
-    as_planned = low_ml >= 0.95 * planned_ml - 0.1
+    as_planned = not times and low_ml >= 0.95 * known.feed_ml - 0.1
     return "" if as_planned else f"{dose} gave {volume}, booked as the latter"
