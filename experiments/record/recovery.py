@@ -35,7 +35,8 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Row = dict[str, float | int | str | bool | None]
 
-REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
+ANEW = "it is written anew from the last 20 MB of the journal"
+REBUILD = f"move it away and resume again: {ANEW}"
 COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
@@ -111,7 +112,7 @@ def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
     try:
         file = open(path, newline="", encoding="utf-8")  # noqa: SIM115 (closed below)
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}; {REBUILD}") from None
+        raise RecordingError(f"{path}: {error.strerror}; resume the run: {ANEW}") from None
     with file as f:
         rows = csv.DictReader(f)
         try:

@@ -62,7 +62,7 @@ def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_i
     assert caplog.text.count(f"{path}: deleted or moved in the run") == 1
     run.reactors.stop()
     rows = len(run.record.rows[0])
-    with pytest.raises(RecordingError, match=r"M0\.csv"):
+    with pytest.raises(RecordingError, match=r"M0\.csv: No such file or directory; resume the run"):
         run.record.complete()
     assert len(run.record.rows[0]) == rows  # for figure and summary
     run.close()

@@ -153,8 +153,9 @@ def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_kno
     assert "the device was restarted in a dose" in run.note()
     end = run.journal("dose_end")[ended]
     assert len(true) == 1 + after_s // 63.0
-    assert end["feed_low_ml"] - 0.1 <= sum(true) <= end["feed_ml"] * (1.0 + end["feed_times"]) + 0.1
-    assert run.off_by_ml() > -0.1 * len(true)
+    more_ml = 0.05 * len(true)  # each dose by itself
+    assert end["feed_low_ml"] <= sum(true) <= end["feed_ml"] * (1.0 + end["feed_times"]) + more_ml
+    assert run.off_by_ml() > -more_ml
 
 
 @pytest.mark.parametrize(
@@ -203,7 +204,11 @@ def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Pa
     run.record.complete()
     given = [row for row in run.record.journal.reread() if row["kind"] == "dose_end"][-1]
     assert given["feed_times"] == 0
-    assert given["feed_ml"] == pytest.approx(0.66, abs=0.1)  # 0.6 s, the look before, and the bias of 0.06 s at 1 mL/s
+    true = [d.seconds for d in run.device.vials["M0"].doses if d.pump == "Pump1"][-1]
+    off_s = [row for row in run.record.journal.reread() if row.get("path") == FEED_OFF][-1]["time_s"]
+    asked_s = off_s - given["on_s"]  # until its off was answered, and the bias of .06 s, at 1 mL/s
+    assert given["feed_ml"] == pytest.approx(asked_s + 0.06, abs=1e-3)
+    assert given["feed_low_ml"] <= true <= given["feed_ml"]
     volume = run.record.series("volume_ml")[0]
     np.testing.assert_allclose(volume, [*[step.volume_ml[0] for step in steps[:-1]], given["feed_ml"]])
     run.record.complete()  # nothing is left to do
