@@ -115,10 +115,9 @@ def fetch(
         raise ProtocolError(f"{what}: not an HTTP answer ({error})") from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
         reason, host = str(error) or type(error).__name__, url.removesuffix(urlsplit(url).path)
-        slow = isinstance(error, httpx.ReadTimeout)  # it was reached
-        remedy = (
-            "its software hangs: look at the board's disk, close its web page" if slow else "check cable and server"
-        )
+        reached = isinstance(error, (httpx.ReadTimeout, httpx.ReadError))
+        hung = "its software hangs or ended: look at the board's disk, close its web page"
+        remedy = hung if reached else "check cable and server"
         raise LinkError(f"{what}: no answer from {host} ({reason}); {remedy}") from error
 
 

@@ -127,8 +127,9 @@ def test_no_answer_is_a_link_error_within_the_time_out(server: Server, behave: C
         server.close()
     else:
         server.behave = behave
-    with link(server.url) as transport, pytest.raises(LinkError, match="/changeDevice/M0"):
+    with link(server.url) as transport, pytest.raises(LinkError, match="/changeDevice/M0") as told:
         transport.post("/changeDevice/M0")
+    assert ("cable" in str(told.value)) == (behave is None), "nobody was reached"
 
 
 @pytest.mark.parametrize(
