@@ -45,7 +45,7 @@ REMEDIES = {
     "spectrometer": "check the spectrometer's cable; restart the device if it persists",
     "frozen": "look at the device's terminal: its measuring thread may be dead",
     "jump": "check for bubbles, foam and a moved vial",
-    "no_dilution": "check feed tube, gasket, bottle (filled: mark it, bottle_ml=ML); clean the vial's wall",
+    "no_dilution": "check bottle (filled: mark it, bottle_ml=ML), feed tube, gasket; clean the vial's wall",
     "cannot_hold": "the culture outgrows the pump, or the pump has become weak: weigh its doses, check gasket and tube",
     "falls": "check for a pump that runs on, a leak, a stopped stirrer",
     "stale": "check link and device",

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from hardware.chibio.dose_sequence import AGAIN
+from hardware.chibio.dose_sequence import AGAIN, DOSE_OFF_S
 from hardware.errors import LinkError
 from hardware.link.transport import Reply
 from tests.hardware.driver_lab import DriverLab
@@ -103,6 +103,35 @@ def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an
     lab.run(4)
     assert bool(notes(lab, "gave 0.00 to") or notes(lab, "gave 1.04 to") or notes(lab, "was repeated")) == told
     check_held(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+
+
+@pytest.mark.parametrize("after_s", [0.3, 0.62, 1.1, 2.2])
+def test_a_feed_pump_switched_on_once_more_in_its_dose_gives_no_more_than_its_window_and_raises_no_level(
+    after_s: float,
+) -> None:
+    """The app shows the same as before, so nothing tells it: declared in docs/faults.md with this bound."""
+    lab = lab_of(rate=0.62 / 60.0)
+    left = [1]
+
+    def page() -> Iterator[float]:
+        lab.device.handle("POST", f"{FEED_ON}M0")
+        yield from ()
+
+    def post(path: str, real: Any) -> Reply:
+        reply: Reply = real(path)
+        if path.startswith(FEED_ON) and left:
+            left.clear()
+            lab.reactors._agenda.add(page(), after_s)
+        return reply
+
+    lab.on_post(post)
+    lab.run(4)
+    lab.clock.sleep(15.0)
+    beyond_ml = lab.truth()["feed_ml"] - float(lab.loop.interlock.budget.fed_ml[0])
+    assert left == []
+    assert beyond_ml <= min(0.62, DOSE_OFF_S) + 0.15
+    assert lab.truth()["peak_ml"] < 21.5
     assert not FALSE_ALARMS & lab.kinds()
 
 
