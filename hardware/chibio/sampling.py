@@ -86,7 +86,7 @@ class Sampling:
         note = ""
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
             late_s = offset - min(self._offsets)
-            note = f"the board's clock moved by {-late_s:.0f} s against this computer's"
+            note = f"the sample before came {-late_s:.0f} s late, or the board's clock was set forward by that"
             if late_s > 0.0:
                 note = f"a sample came {late_s:.0f} s late, or the board's clock was set back by that"
             self._offsets.clear()

@@ -103,6 +103,7 @@ def test_how_much_lateness_is_a_step_of_a_clock(step_s: float, told: bool) -> No
     clock.sleep(60.0)
     said = take(sampling, clock, sample(60.0 - step_s, 2))
     assert (f"{abs(step_s):.0f} s" in said) == told
+    assert ("late" in said) == told, "a late sample is no moved clock"
 
 
 def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_time() -> None:
