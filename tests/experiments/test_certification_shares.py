@@ -116,7 +116,7 @@ def by_brute_force(strip: tuple[float, float], case: ShareCase, step: float = 0.
     e = np.arange(-2.0, 2.0 + step, step)
     bound = np.maximum(off.error, np.log(1.0 + off.od / (r * np.exp(off.full_pump * e))) / off.full_pump)
     least, most = np.full(e.size, np.inf), np.full(e.size, -np.inf)
-    for scale in (1.0 - case.scale, 1.0, 1.0 + case.scale):
+    for scale in {1.0 - case.scale, 1.0, 1.0 + case.scale}:
         said = np.abs(e - scale * e[:, None]) <= bound  # (true, estimate)
         known = said.any(axis=1)
         first, last = e[said.argmax(axis=1)], e[e.size - 1 - said[:, ::-1].argmax(axis=1)]
@@ -125,7 +125,7 @@ def by_brute_force(strip: tuple[float, float], case: ShareCase, step: float = 0.
             for s in strip:
                 for wrong in (-off.growth_share, 0.0, off.growth_share):
                     level = np.rint(16.0 * np.clip(estimate + s + wrong, 0.0, 1.0)) / 16.0
-                    for gain in (1.0 - case.spread, 1.0, 1.0 + case.spread):
+                    for gain in {1.0 - case.spread, 1.0, 1.0 + case.spread}:
                         then = np.where(known, e + s - gain * level, 0.0)
                         least, most = np.minimum(least, then), np.maximum(most, then)
     low, high = e[0] / 2.0, e[-1] / 2.0
