@@ -67,8 +67,9 @@ def imported(module: str) -> Iterator[str]:
                 yield full if full in modules() else node.module
 
 
-def ours(module: str) -> set[str]:
-    return {name for name in imported(module) if name in modules() and name != module}
+@cache
+def ours(module: str) -> frozenset[str]:
+    return frozenset(name for name in imported(module) if name in modules() and name != module)
 
 
 def is_command(module: str) -> bool:
