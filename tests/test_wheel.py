@@ -71,7 +71,7 @@ def test_the_way_from_a_recording_to_a_page_from_another_folder(installed: Path,
         "calibrate",
         "train env_file=latest agent.total_steps=400 agent.learn_start=100",
         "deploy policy=latest scenario=hold scenario.minutes=[10]",
-        "certify policy=shipped",
+        "certify policy=shipped quick=true trajectories=0",
         "report",
     ):
         done = run(installed, tmp_path, "-m", "experiments", *line.split())
