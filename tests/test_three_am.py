@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 CODE = re.compile(r"`([^`]+)`")
 VARIES = re.compile(r"…|%[\d.]*[sdfg]")
 ERRORS = {"DeviceStateError", "IdentityError", "LinkError", "ProtocolError", "RecordingError"}
-TELLS = {"tell", "say", "Fault", "Finding", "_Reason"} | ERRORS
+TELLS = {"tell", "say", "_mend", "Fault", "Finding", "_Reason"} | ERRORS
 LOGS = {"warning", "error", "exception"}
 SAID = {  # which calls say something, in which files
     "hardware/safety/*.py": TELLS, "hardware/chibio/*.py": TELLS, "hardware/pioreactor/*.py": TELLS,
@@ -25,8 +25,8 @@ SAID = {  # which calls say something, in which files
     "hardware/board/board_agent.py": LOGS,
 }  # fmt: skip
 NAMED = {  # what is assigned to these, appended or returned is said elsewhere
-    "said", "repairs", "repaired", "outcome", "who", "trouble", "foreign", "end", "why", "refusal", "texts",
-    "_words", "_not_off", "_measure_lateness", "_finish",
+    "said", "repairs", "repaired", "outcome", "who", "how", "plug", "trouble", "foreign", "end", "why", "refusal",
+    "texts", "_words", "_not_off", "_measure_lateness", "_finish",
 }  # fmt: skip
 ELSEWHERE = {  # at the start of a run or of a procedure, where somebody reads it
     "an experiment is running; stop it before pumps are weighed", "it runs all the same: force_policy=true",
