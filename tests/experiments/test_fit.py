@@ -47,7 +47,7 @@ def test_what_fits_is_taken(tmp_path: Path) -> None:
     [
         ({"scenario": OF_TWO}, "scenario.ratios: backend=pioreactor "),
         ({"scenario": OF_TWO, "backend": RigBackendConfig()}, "backend=pioreactor_rig "),
-        ({"scenario": replace(CALM, outputs=("pump3 2 mL/h", None))}, "scenario.outputs: backend=pioreactor "),
+        ({"scenario": replace(CALM, outputs=("pump3 2 mL/h", None))}, "scenario.outputs of pio01: pump 3"),
         ({"scenario": WARMER, "backend": PioreactorConfig(thermostat=False)}, "30 to 37 degC: .* backend.thermostat"),
         ({"controller": registry.config("oracle")}, "oracle: .* not backend=pioreactor$"),
         ({"backend": PioreactorConfig(max_dose_ml=0.9)}, "1.2 mL in a period of 60 s; give bench.max_rate=0.015 "),
