@@ -20,7 +20,7 @@ from hardware.clock import VirtualClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.pioreactor import reactors
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.doses import History
+from hardware.pioreactor.doses import History, replay
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.web import NotHeard, Web
@@ -530,6 +530,24 @@ class Lab:
         self.reactors = PioreactorReactors(config, self.world, self._log, "run", self.bench)
         self.station = self.reactors.stations[0]
 
+    def resumed(self, monkeypatch: pytest.MonkeyPatch, away_s: float, elapsed_s: float, **values: Any) -> "Lab":
+        """A program that was killed and goes on from the rows of its journal, so long afterwards."""
+        rows, self.world.box = list(self.rows), None
+        self.world.sleep(away_s)
+        again = Lab(monkeypatch, self.world, **values)
+        again.rows = rows
+        again.begin(replay(rows)[UNIT], elapsed_s + away_s)
+        return again
+
+    def well(self, limit_s: float = 100.0) -> None:
+        """Wait until there is no fault, and no dose is under way."""
+        self.until(lambda: self.fault is None and not self.station.doses.running, limit_s)
+
+    def check_given(self, slack_ml: float) -> None:
+        """What flowed of medium lies within what is on record."""
+        low, high = self.given()
+        assert low - slack_ml <= self.world.truth["add_media"] <= high + slack_ml
+
     @property
     def fault(self) -> Any:
         return self.station.book.fault
@@ -592,3 +610,11 @@ class Lab:
         """Book what the driver said of doses since the last time."""
         for at, receipt in self.reactors.repeated():
             budget.book(receipt.volume_ml, receipt.waste_ml, at)
+
+
+def sampled(*given: Any, **values: Any) -> Lab:
+    """A lab whose run has begun and has its first sample."""
+    made = Lab(*given, **values)
+    made.begin()
+    made.sample()
+    return made

@@ -12,15 +12,12 @@ from hardware.pioreactor.pumps import LATE_ML
 from hardware.pioreactor.versions import TESTED
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal
-from tests.hardware.pioreactor_lab import ALT_PIN, FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
+from tests.hardware.pioreactor_lab import ALT_PIN, FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World, sampled
 
 
 @pytest.fixture
 def lab(monkeypatch):
-    made = Lab(monkeypatch)
-    made.begin()
-    made.sample()
-    return made
+    return sampled(monkeypatch)
 
 
 def test_a_dose_is_written_down_then_media_then_twice_the_waste_with_one_id(lab):
@@ -67,9 +64,7 @@ def test_a_rate_that_is_none_is_refused(lab, rate):
 
 
 def test_samples_go_on_while_the_fate_of_a_dose_is_open(monkeypatch):
-    lab = Lab(monkeypatch, period_s=30.0)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, period_s=30.0)
     lab.world.queue = False
     lab.dose(0.5)
     before = len(lab.of("sample"))
@@ -102,7 +97,6 @@ def test_each_dose_of_somebody_else_is_counted_once_as_what_it_is_and_holds_ours
     for ml in volumes:
         lab.world.event(pump, ml, "UI")
         lab.wait(1.0)
-    assert lab.fault is not None
     assert lab.fault.kind == "mode"
     rows, booked = lab.of("given"), lab.reactors.repeated()
     told = np.array([(r["feed_ml"], r["feed_low_ml"], r["waste_ml"]) for r in rows])
@@ -272,22 +266,15 @@ def test_what_a_media_pump_gave_too_much_is_drained_also_while_pumps_are_off_and
 @pytest.mark.parametrize("pin", [MEDIA_PIN, WASTE_PIN])
 def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypatch, version, away_s, pin):
     """Whatever time passed: not by the time that nobody watched. In its waste the unit loses its power, too."""
-    lab = Lab(monkeypatch, World(version))
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, World(version))
     lab.dose(0.8)
     lab.until(lambda: pin in lab.world.since, 10.0)
     lab.wait(0.2)
     if pin == WASTE_PIN:
         lab.world.cut()
         lab.world.power()
-    rows, world = list(lab.rows), lab.world
-    assert replay(rows)[UNIT].open
-    world.box = None
-    world.sleep(away_s)
-    again = Lab(monkeypatch, world)
-    again.rows = rows
-    again.begin(replay(rows)[UNIT], 60.0 + away_s)
+    assert replay(lab.rows)[UNIT].open
+    again, world = lab.resumed(monkeypatch, away_s, 60.0), lab.world
     took = again.until(lambda: bool(again.of("dose_end")), 100.0)
     assert took <= 100.0
     (end,) = again.of("dose_end")
@@ -304,21 +291,14 @@ def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypa
 
 
 @pytest.mark.parametrize("rebooted", [False, True])
-def test_after_a_resume_nobody_is_told_to_pull_a_plug_while_no_pump_is_told_on(monkeypatch, rebooted):
+def test_after_a_resume_nobody_is_told_to_pull_a_plug_while_no_pump_is_told_on(monkeypatch, lab, rebooted):
     """Its program was killed in a dose, which has ended since: by itself, or with the unit's power."""
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
     lab.dose(0.8)
     lab.until(lambda: MEDIA_PIN in lab.world.since, 10.0)
     if rebooted:
         lab.world.cut()
         lab.world.power()
-    rows, world = list(lab.rows), lab.world
-    world.box = None
-    world.sleep(20.0)
-    again = Lab(monkeypatch, world)
-    again.begin(replay(rows)[UNIT], 80.0)
+    again = lab.resumed(monkeypatch, 20.0, 60.0)
     told = []
     again.until(lambda: told.append(str(again.fault)) or not again.station.doses.running, 15.0)
     again.until(lambda: told.extend(again.reactors.pumps_off(np.array([True]))) or again.fault is None, 1.0)
@@ -368,9 +348,7 @@ def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
 
 @pytest.mark.parametrize("version", TESTED)
 def test_the_unit_s_own_ledger_is_put_to_the_level_that_was_read(monkeypatch, version):
-    lab = Lab(monkeypatch, World(version))
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, World(version))
     lab.world.web = False
     lab.reactors.set_level(0, 18.5)
     lab.wait(20.0)
@@ -398,9 +376,7 @@ def test_ten_times_faster_readings_of_a_dose_do_not_count_for_the_sample_after_i
 
 
 def test_five_times_faster_a_period_of_two_minutes_is_dosed_whole_and_an_old_sample_not_at_all(monkeypatch):
-    lab = Lab(monkeypatch, speed=5.0, period_s=120.0, waste_factor=3.0)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, speed=5.0, period_s=120.0, waste_factor=3.0)
     assert lab.dose(0.9) == 0.9
     lab.wait(10.0)
     assert lab.world.truth["add_media"] == pytest.approx(0.9, abs=0.02)
@@ -438,9 +414,7 @@ def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put
 @pytest.mark.parametrize(("volume_ml", "rim_ml"), [(14.0, 20.0), (30.0, 40.0)])
 def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch, volume_ml, rim_ml):
     """A media pump that stood on for half a minute gave some 21 mL; a stop drains nothing."""
-    lab = Lab(monkeypatch, volume_ml=volume_ml)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, volume_ml=volume_ml)
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 29.0
     planned = lab.dose(0.7)
     lab.until(lambda: bool(lab.world.since), 5.0)
@@ -455,9 +429,7 @@ def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch
 
 def test_a_drain_that_the_broker_and_then_the_end_of_a_run_cut_is_booked_with_the_least_that_it_took(monkeypatch):
     monkeypatch.setitem(FLOW, "remove_waste", 0.9)
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 4.0
     planned = lab.dose(0.7)
     lab.until(lambda: set(lab.world.since) == {WASTE_PIN}, 20.0)
@@ -497,9 +469,7 @@ def test_each_pump_s_flow_is_that_of_its_own_calibration_and_on_record(lab):
 
 def test_after_a_crash_a_pump_that_cannot_be_proven_off_is_told_after_a_while(monkeypatch):
     """Five times faster; the task queue is dead, so no short run comes, and nobody tells the pump on."""
-    lab = Lab(monkeypatch, speed=5.0)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, speed=5.0)
     lab.world.queue = False
     lab.dose(0.8)
     lab.wait(0.5)
@@ -516,10 +486,7 @@ def test_after_a_crash_a_pump_that_cannot_be_proven_off_is_told_after_a_while(mo
 
 @pytest.fixture
 def two(monkeypatch):
-    made = Lab(monkeypatch, alt_media=True)
-    made.begin()
-    made.sample()
-    return made
+    return sampled(monkeypatch, alt_media=True)
 
 
 def test_a_dose_of_the_alt_media_pump_is_followed_booked_as_pump_3_and_wasted_as_one_of_media(two):
@@ -542,12 +509,7 @@ def test_a_dose_of_the_alt_media_pump_in_which_the_program_is_killed_is_booked_a
 ):
     two.dose(0.9, pump=3)
     two.until(lambda: ALT_PIN in two.world.since, 10.0)
-    rows, world = list(two.rows), two.world
-    world.box = None
-    world.sleep(away_s)
-    again = Lab(monkeypatch, world, alt_media=True)
-    again.rows = rows
-    again.begin(replay(rows)[UNIT], 60.0 + away_s)
+    again, world = two.resumed(monkeypatch, away_s, 60.0, alt_media=True), two.world
     again.until(lambda: not again.station.doses.running, 60.0)
     low, high = again.given()
     assert low <= world.truth["add_alt_media"] <= high + 0.02

@@ -14,7 +14,7 @@ import pytest
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.pumps import Seen, is_off
 from hardware.pioreactor.versions import TESTED
-from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World
+from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World, sampled
 
 MEDIA_S, SLACK_ML = 1.4 / FLOW["add_media"], 0.1
 BACK_S = 100.0  # after what was wrong is over, until a dose is possible again
@@ -261,9 +261,7 @@ def test_while_a_media_pump_cannot_be_stopped_the_vial_is_drained_up_to_a_bound(
     monkeypatch, waste_ml_s, bottle_ml, least
 ):
     monkeypatch.setitem(FLOW, "remove_waste", waste_ml_s)
-    lab = Lab(monkeypatch, bottle_ml=bottle_ml)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, bottle_ml=bottle_ml)
     lab.world.kill_after_s = 0.2
     lab.dose(1.4)
     began = lab.world.since[MEDIA_PIN] if lab.until(lambda: MEDIA_PIN in lab.world.since, 5.0) >= 0.0 else 0.0
@@ -284,9 +282,7 @@ def test_a_pump_that_cannot_be_stopped_is_booked_as_it_flows_and_spills_no_more_
 ):
     """Up to 60 mL, also where the waste pump is no stronger than the media pump."""
     monkeypatch.setitem(FLOW, "remove_waste", waste_ml_s)
-    lab = Lab(monkeypatch, volume_ml=volume_ml)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch, volume_ml=volume_ml)
     lab.world.kill_after_s = 0.2
     ledger = lab.ledger(lab.dose(0.9))
     rates = {MEDIA_PIN: FLOW["add_media"], WASTE_PIN: -waste_ml_s}
@@ -302,7 +298,7 @@ def test_a_pump_that_cannot_be_stopped_is_booked_as_it_flows_and_spills_no_more_
         assert float(ledger.volume_ml[0]) >= volume_ml + rise - 0.9 - 2.0 * SLACK_ML, "its waste was booked with it"
         assert spilled <= lab.station.unit.config.max_dose_ml
     lab.world.locks.clear()
-    lab.until(lambda: lab.fault is None and not lab.station.doses.running, BACK_S)
+    lab.well()
     lab.book(ledger)
     assert float(ledger.fed_ml[0]) == pytest.approx(lab.given()[1], abs=SLACK_ML)
     assert float(ledger.fed_ml[0]) == pytest.approx(lab.world.truth["add_media"], abs=1.0)
@@ -311,16 +307,13 @@ def test_a_pump_that_cannot_be_stopped_is_booked_as_it_flows_and_spills_no_more_
 
 def test_a_media_pump_that_stands_on_past_its_dose_is_drained_at_once(monkeypatch):
     """Its process is frozen: the vial rises by the dose and by what flows until the waste pump has begun."""
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 15.0
     lab.dose(1.4)
     lab.until(lambda: WASTE_PIN in lab.world.since, 10.0)
     assert lab.world.level_ml < 20.0 + 1.4 + 1.5 * FLOW["add_media"]
-    lab.until(lambda: lab.fault is None and not lab.station.doses.running, BACK_S)
-    low, high = lab.given()
-    assert low - SLACK_ML <= lab.world.truth["add_media"] <= high + SLACK_ML
+    lab.well()
+    lab.check_given(SLACK_ML)
 
 
 def test_a_pump_that_told_what_it_is_about_to_give_and_no_end_is_drained_beside(monkeypatch):
@@ -334,17 +327,14 @@ def test_a_pump_that_told_what_it_is_about_to_give_and_no_end_is_drained_beside(
     lab.wait(18.0)
     level = (lab.world.now() - lab.world.since[MEDIA_PIN]) * FLOW["add_media"] - lab.world.truth["remove_waste"]
     assert level < 6.0
-    lab.until(lambda: lab.fault is None and not lab.station.doses.running, BACK_S)
-    low, high = lab.given()
-    assert low - SLACK_ML <= lab.world.truth["add_media"] <= high + SLACK_ML
+    lab.well()
+    lab.check_given(SLACK_ML)
 
 
 @pytest.mark.parametrize("broken", ["lose_broker", "freeze_broker"])
 def test_nobody_is_told_to_pull_a_plug_where_only_the_broker_was_gone(monkeypatch, broken):
     """A job ends with its broker."""
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.dose(1.4)
     in_the_dose(lambda lab: getattr(lab.world, broken)(20.0))(lab)
     seen = set()
@@ -356,9 +346,7 @@ def test_nobody_is_told_to_pull_a_plug_where_only_the_broker_was_gone(monkeypatc
 
 
 def test_short_runs_of_a_pump_do_not_pile_up_in_a_queue_that_is_dead(monkeypatch):
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.world.kill_after_s = 0.2
     lab.dose(0.5)
     lab.wait(2.0)
@@ -368,8 +356,7 @@ def test_short_runs_of_a_pump_do_not_pile_up_in_a_queue_that_is_dead(monkeypatch
     assert len([o for _, o in lab.world.asked if "duration" in o]) <= 1
     lab.world.revive()
     lab.until(lambda: lab.fault is None, BACK_S)
-    low, high = lab.given()
-    assert low - SLACK_ML <= lab.world.truth["add_media"] <= high + SLACK_ML
+    lab.check_given(SLACK_ML)
 
 
 def test_a_killed_job_of_an_earlier_run_is_proven_off_before_the_first_dose(monkeypatch):
@@ -379,7 +366,7 @@ def test_a_killed_job_of_an_earlier_run_is_proven_off_before_the_first_dose(monk
     lab.begin()
     lab.sample()
     assert lab.dose(0.5) in (0.0, 0.5)
-    lab.until(lambda: lab.fault is None and not lab.station.doses.running, BACK_S)
+    lab.well()
 
 
 @pytest.mark.parametrize("seed", range(16))
@@ -411,7 +398,7 @@ def test_faults_at_random_moments_leave_a_ledger_that_holds(monkeypatch, seed):
         if kind == "cut":
             lab.world.power()
         lab.world.locks -= {pin for job, pin in PINS.items() if job not in lab.world.run_now}
-        lab.until(lambda: lab.fault is None and not lab.station.doses.running, BACK_S)
+        lab.well()
         settle(lab)
         low, high = lab.given()
         assert low - SLACK_ML * (k + 1) <= lab.world.truth["add_media"] <= high + SLACK_ML * (k + 1), kind

@@ -26,37 +26,34 @@ from hardware.pioreactor.station import UNHEARD
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.pioreactor.web import Web
 from hardware.rig import family as rig
-from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
+from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, WASTE_PIN, Lab, World, sampled
 
 
 @pytest.fixture
 def lab(monkeypatch):
-    made = Lab(monkeypatch, stirring=True, thermostat=True, temperature=30.0)
-    made.begin()
-    made.sample()
-    return made
+    return sampled(monkeypatch, stirring=True, thermostat=True, temperature=30.0)
 
 
 def started(lab, job):
     return [options for name, options in lab.world.asked if name == job]
 
 
-def test_each_is_started_once(lab):
-    for _ in range(3):
-        lab.sample()
-    assert [len(started(lab, job)) for job in ("od_reading", "stirring", "temperature_automation")] == [1, 1, 1]
-    assert started(lab, "temperature_automation")[0]["target-temperature"] == 30.0
-
-
-@pytest.mark.parametrize("job", ["stirring", "temperature_automation"])
-def test_what_a_reboot_ended_is_started_again_and_nothing_is_dosed_without_it(lab, job):
+@pytest.mark.parametrize(
+    ("version", "forget"), [("26.7.2", "pio jobs purge --job-name {}, else reboot"), ("25.11.19", "reboot")]
+)
+@pytest.mark.parametrize(("job", "said"), [("stirring", "does not stir"), ("temperature_automation", "does not heat")])
+def test_what_a_reboot_ended_is_started_again_named_with_what_helps_and_nothing_is_dosed_without_it(
+    monkeypatch, version, forget, job, said
+):
+    """By what its version knows against it."""
+    lab = sampled(monkeypatch, World(version), stirring=True, thermostat=True)
     lab.world.barred = True
     lab.world.rows.pop(job)
     lab.world.say(f"{job}/$state", "lost")
     for _ in range(5):  # as long as it is gone, also between two attempts
         lab.wait(13.0)
-        assert lab.fault is not None
-        assert lab.fault.kind == "stopped"
+        assert (lab.fault.kind, said in lab.fault.detail) == ("stopped", True)
+        assert f"on the unit: {forget.format(job)}" in lab.fault.remedy
     assert lab.dose(0.5) == 0.0
     assert 2 <= len(started(lab, job)) - 1 <= 4
     lab.world.barred = False
@@ -302,22 +299,6 @@ def test_while_one_unit_is_switched_off_the_others_go_on() -> None:
     assert (quick.steps, slow.steps, stuck.steps) == (51 - 2, 1, 51 - 10)  # from when on their pumps were off
 
 
-@pytest.mark.parametrize(
-    ("version", "forget"), [("26.7.2", "pio jobs purge --job-name {}, else reboot"), ("25.11.19", "reboot")]
-)
-@pytest.mark.parametrize(("job", "said"), [("stirring", "does not stir"), ("temperature_automation", "does not heat")])
-def test_a_job_that_is_gone_is_named_with_what_its_version_knows_against_it(monkeypatch, version, forget, job, said):
-    lab = Lab(monkeypatch, World(version), stirring=True, thermostat=True)
-    lab.begin()
-    lab.sample()
-    lab.world.barred = True
-    lab.world.rows.pop(job)
-    lab.world.say(f"{job}/$state", "lost")
-    lab.wait(25.0)
-    assert said in lab.fault.detail
-    assert f"on the unit: {forget.format(job)}" in lab.fault.remedy
-
-
 def test_a_target_is_written_down_once_and_sent_once_and_nan_leaves_it(lab):
     before, said = len(lab.of("temperature")), len(lab.world.mqtt.said)
     for target in (33.0, 33.0, float("nan"), 33.0):
@@ -329,13 +310,12 @@ def test_a_target_is_written_down_once_and_sent_once_and_nan_leaves_it(lab):
 
 
 @pytest.mark.parametrize(("stirring", "thermostat"), [(True, False), (False, True)])
-def test_only_the_jobs_that_a_run_wants_run(monkeypatch, stirring, thermostat):
-    lab = Lab(monkeypatch, stirring=stirring, thermostat=thermostat, temperature=31.0)
-    lab.begin()
-    lab.sample()
+def test_only_the_jobs_that_a_run_wants_run_and_each_is_started_once(monkeypatch, stirring, thermostat):
+    lab = sampled(monkeypatch, stirring=stirring, thermostat=thermostat, temperature=31.0)
     lab.wait(30.0)
     wanted = {"od_reading", "stirring"} | ({"temperature_automation"} if thermostat else set())
-    assert {job for job, options in lab.world.asked if "help" not in options} == wanted
+    assert sorted(job for job, options in lab.world.asked if "help" not in options) == sorted(wanted)
+    assert [options["target-temperature"] for options in started(lab, "temperature_automation")] == [31.0] * thermostat
     assert lab.station._box.live("stirring") is stirring, "switched for a moment, to hear of its pin"
     assert lab.fault is None
 

@@ -18,7 +18,7 @@ from hardware.pioreactor.family import PioreactorFamily
 from hardware.pioreactor.mailbox import LIVE, LOCKS, WORDS, Cluster, Mailbox, Reading, State
 from hardware.pioreactor.sampling import Sampling
 from hardware.safety.config import RAW_MIN
-from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World
+from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World, sampled
 
 
 def mailbox():
@@ -194,9 +194,7 @@ def test_samples_keep_their_beat_also_when_each_is_looked_at_late(late_s):
 @pytest.mark.parametrize("said", ["lost", "ready", "disconnected"])
 def test_a_reader_that_brings_nothing_is_noticed_and_started_anew_whatever_it_says(monkeypatch, said):
     """Killed, stopped, or, as when the vendor's lock on the lamp was left behind, there by its own word."""
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.world.od_alive = False
     lab.world.say("od_reading/$state", said)
     lab.until(lambda: lab.fault is not None and lab.fault.kind == "stopped", 100.0)
@@ -208,9 +206,7 @@ def test_a_reader_that_brings_nothing_is_noticed_and_started_anew_whatever_it_sa
 
 
 def test_silence_is_told_in_the_age_of_the_sample(monkeypatch):
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     lab.world.od_s = 1e9
     for _ in range(8):
         m = lab.reactors.measure()
@@ -235,9 +231,7 @@ def test_a_wrong_value_is_named(values, named):
 
 
 def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_decides(monkeypatch):
-    lab = Lab(monkeypatch)
-    lab.begin()
-    lab.sample()
+    lab = sampled(monkeypatch)
     before = len(lab.of("sample"))
     lab.world.sleep(70.0)
     assert lab.reactors.pumps_off(np.array([True])) == []
