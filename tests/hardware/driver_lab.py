@@ -38,14 +38,8 @@ class Spy(Transport):
         self.posts.append((self.clock.now(), path))
         return self.inner.post(path)
 
-    def disarm(self) -> None:
-        self.inner.disarm()
-
     def switched_off(self) -> SwitchedOff:
         return self.inner.switched_off()
-
-    def close(self) -> None:
-        self.inner.close()
 
 
 class Law:

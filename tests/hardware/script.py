@@ -57,9 +57,6 @@ class Script(Transport):
     def post(self, path: str) -> Reply:
         return self._next(f"POST {path}")
 
-    def disarm(self) -> None:
-        pass
-
     def close(self) -> None:
         assert not self.steps, f"never asked: {self.steps}"
 

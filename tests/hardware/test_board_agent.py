@@ -512,16 +512,6 @@ def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: AgentLab) -> N
     short.until(lambda: "pumps verified off" in short.log.read_text(), timeout=12.0)
 
 
-@pytest.mark.slow
-def test_switching_off_is_repeated_until_it_can_be_verified(short: AgentLab) -> None:
-    short.pump("Pump1", "M0", 1.0)
-    short.emulator.fault("lying/all/-1")
-    short.until(lambda: "still on: Pump1" in short.log.read_text())
-    short.emulator.fault("lying/all/0")
-    short.until(lambda: not short.motors())
-    short.until(lambda: "pumps verified off" in short.log.read_text())
-
-
 def test_a_stopped_agent_leaves_no_pump_running(short: AgentLab) -> None:
     short.pump("Pump1", "M1", 1.0)
     short.until(lambda: short.motors() == {"M1/Pump1"})

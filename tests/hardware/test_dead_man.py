@@ -9,6 +9,7 @@ import pytest
 
 from hardware.board import board_agent
 from hardware.board.board_agent import BoardAgent, Device
+from hardware.emulator.faults import inject
 from hardware.link.serial import encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_board_agent import Recorder
@@ -125,6 +126,9 @@ def test_a_pass_switches_every_pump_off_and_remembers_each_that_it_found_on() ->
         lab.pump(pump, 1.0, reactor=reactor)
     lab.wait(2.0)
     agent = BoardAgent(Emulated(lab), 120.0)
+    inject(lab.device, "lying", "all", -1)
+    assert agent.sweep(agent._beats) == ["M0: still on: Pump1, Pump2", "M1 cannot be selected"]
+    inject(lab.device, "lying", "all", 0)
     assert agent.sweep(agent._beats) == []
     lab.wait(1.0)
     assert not any(any(lab.device.truth(m)["motors"].values()) for m in ("M0", "M1"))

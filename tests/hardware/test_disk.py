@@ -2,7 +2,6 @@
 
 A power cut keeps what was synced, and a new name only if its folder was synced after it."""
 
-import json
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ import pytest
 
 from hardware.errors import RecordingError
 from hardware.storage import atomic
-from hardware.storage.journal import LANDMARKS, Journal
+from hardware.storage.journal import Journal
 from hardware.storage.recorder import Recorder
 
 Tape = list[tuple[Any, ...]]
@@ -150,10 +149,12 @@ def test_a_recording_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.
             assert (tmp_path / "r").read_bytes() == b"time_min,od\n"  # no half of a row before the next one
 
 
-def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
-    (tmp_path / "r").write_text("my shopping list\n")
+@pytest.mark.parametrize("content", ["time_min,od\n1,2\n", "my shopping list"])
+def test_a_foreign_file_is_refused_left_alone_and_closed(tmp_path: Path, content: str) -> None:
+    (tmp_path / "r").write_text(content)
     with pytest.raises(RecordingError, match="choose another file"):
         Recorder(tmp_path / "r", ["time_min"])
+    assert (tmp_path / "r").read_text() == content
 
 
 def test_the_newest_rows_are_read_again_from_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,26 +205,33 @@ def test_a_row_that_lacks_what_all_rows_have_is_named(tmp_path: Path, line: byte
         Journal(tmp_path / "j")
 
 
+KEPT = ("start", "device", "temperature", "regulate", "overflow_pump", "level", "share", "bottle")
+
+
 def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first row, the landmarks before the tail, each row that begins in the tail; for each length of the tail."""
-    path = tmp_path / "j"
+    """The first row, landmarks and open doses before the tail, each row that begins in it; for every tail."""
+    path, rng = tmp_path / "j", np.random.default_rng(0)
+    kinds = ["sample", *rng.permutation([*KEPT, *rng.choice(["sample", "command", "intent", "dose_end"], 40)]).tolist()]
+    reactors = rng.choice(["M0", "M3"], len(kinds)).tolist()
     journal = Journal(path, wall=lambda: 1.0, fsync=False)
-    for k in range(12):
-        journal.append("device" if k in (3, 7, 8) else "sample", {"k": k, "pad": "x" * (k % 5)})
+    for k, (kind, reactor) in enumerate(zip(kinds, reactors, strict=True)):
+        journal.append(kind, {"reactor": reactor, "k": k, "pad": "x" * (k % 5)})
     journal.close()
     lines = path.read_bytes().splitlines(keepends=True)
-    begins, torn = np.cumsum([0, *map(len, lines)]), b'{"n":12,"ki'
+    begins, torn = np.cumsum([0, *map(len, lines)]), b'{"n":49,"ki'
     for tail in range(len(lines[-1]) + len(torn) + 1, begins[-1] + 40, 5):
         monkeypatch.setattr("hardware.storage.journal.TAIL", tail)
         path.write_bytes(b"".join(lines) + torn)
         cut = max(begins[-1] + len(torn) - tail, 0)
-        kept = [k for k in range(12) if k in (0, 3, 7, 8) or begins[k] > cut or cut == 0]
+        late = [k for k in range(len(kinds)) if begins[k] > cut or cut == 0]
+        doses: dict[str, list[int]] = {}
+        for k in sorted(set(range(len(kinds))) - set(late)):
+            if kinds[k] in ("intent", "dose_end"):
+                doses[reactors[k]] = []
+            if kinds[k] == "intent" or doses.get(reactors[k]):
+                doses[reactors[k]].append(k)
+        kept = {0, *late, *(k for k, kind in enumerate(kinds) if kind in KEPT)}.union(*doses.values())
         reader = Journal(path, fsync=False)
         reader.close()
-        assert [row["k"] for row in reader.rows] == kept
-        assert (reader.cut, reader.next_row) == (len(torn), 12)
-    assert all(
-        json.loads(b"{" + mark + b"}")["kind"]
-        in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "bottle", "start")
-        for mark in LANDMARKS
-    )
+        assert [row["k"] for row in reader.rows] == sorted(kept)
+        assert (reader.cut, reader.next_row) == (len(torn), 49)

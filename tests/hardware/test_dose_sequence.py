@@ -62,12 +62,6 @@ class Line(Transport):
         self.trouble(path)
         return answer(state(**{**self.flags, **self.shown}))
 
-    def disarm(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
     def sent(self) -> list[str]:
         return [path for _, path in self.posts]
 

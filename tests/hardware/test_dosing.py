@@ -13,14 +13,7 @@ from hypothesis import strategies as st
 
 from hardware.chibio.calibrations import load_calibrations, save_calibration
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import (
-    DosingConfig,
-    PumpCalibration,
-    ReactorCalibration,
-    SupplyConfig,
-    fit_pump,
-    plan_dose,
-)
+from hardware.chibio.dosing import DosingConfig, PumpCalibration, ReactorCalibration, SupplyConfig, fit_pump, plan_dose
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.errors import UnfitError
 

@@ -76,12 +76,6 @@ class Hostile(Transport):
         reply = self.inner.post(path)
         return Reply(500, b"") if self.angry and not self.torn and self.rng.random() < 0.1 else reply
 
-    def disarm(self) -> None:
-        self.inner.disarm()
-
-    def close(self) -> None:
-        self.inner.close()
-
 
 Rows = list[dict[str, Any]]
 

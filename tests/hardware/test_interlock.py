@@ -177,24 +177,23 @@ def test_thirty_healthy_reactors_for_a_day_are_left_alone(mu: float) -> None:
     assert np.all(interlock.budget.volume_ml <= 20.0)
 
 
-@pytest.mark.parametrize("mu", [0.014, 0.025])
-@pytest.mark.parametrize("spoilt", ["gain_factor", "media_left_ml"])
-def test_a_blocked_pump_or_an_empty_bottle_is_found_within_25_min_in_every_reactor(mu: float, spoilt: str) -> None:
+@pytest.mark.parametrize(
+    ("spoilt", "value", "mu", "n", "minutes", "least"),
+    [
+        *((spoilt, 0.0, mu, 30, 25, 30) for spoilt in ("gain_factor", "media_left_ml") for mu in (0.014, 0.025)),
+        ("gain_factor", 0.3, None, 20, 100, 19),  # once the culture outgrows it
+    ],
+)
+def test_a_weak_pump_or_an_empty_bottle_is_found(
+    spoilt: str, value: float, mu: float | None, n: int, minutes: int, least: int
+) -> None:
     sound = replace(plant_preset("bench"), sensor=NOISY)
-    sound = replace(sound, growth=replace(sound.growth, mu=mu))
-    _, verdicts, _ = cultivate(sound, 30, 145, (120, spoilt, 0.0), 0.5)
-    found = np.zeros(30, dtype=bool)
+    sound = replace(sound, growth=replace(sound.growth, mu=mu or sound.growth.mu))
+    _, verdicts, _ = cultivate(sound, n, 120 + minutes, (120, spoilt, value), 0.5)
+    found = np.zeros(n, dtype=bool)
     for verdict in verdicts[120:]:
         found |= ["no_dilution" in kinds or "cannot_hold" in kinds for kinds in verdict.kinds]
-    assert found.all()
-
-
-def test_a_pump_at_a_third_is_found_when_the_culture_outgrows_it() -> None:
-    _, verdicts, _ = cultivate(replace(plant_preset("bench"), sensor=NOISY), 20, 220, (120, "gain_factor", 0.3), 0.5)
-    found = np.zeros(20, dtype=bool)
-    for verdict in verdicts[120:]:
-        found |= ["cannot_hold" in kinds or "no_dilution" in kinds for kinds in verdict.kinds]
-    assert found.mean() > 0.9
+    assert found.sum() >= least
 
 
 # -- attacked --------------------------------------------------------------------------------------------------------
@@ -247,26 +246,6 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
             interlock = Interlock(n, c, bench)
             interlock.restore(state)
     assert fed.sum() > 2.0
-
-
-def test_one_reactor_of_eight_is_the_same_as_one_alone() -> None:
-    rng = np.random.default_rng(3)
-    od = 0.5 + 0.02 * rng.standard_normal((60, 8))
-    od[rng.random(od.shape) < 0.05] = 12.0
-    together, alone = Interlock(8), [Interlock(1) for _ in range(8)]
-    for k, row in enumerate(od):
-
-        def ask(lock: Interlock, values: np.ndarray, k: int = k) -> Ruling:
-            n = len(values)
-            m = Measurement(np.full(n, 60.0 * k), values, np.full(n, 37.0), np.ones(n, bool))
-            v = lock.check(m, np.full(n, 0.01), np.full(n, 0.5), np.full(n, 37.0), 60.0 * k)
-            lock.confirm(Receipt(60.0 * v.rate), 60.0 * k)
-            return v
-
-        v = ask(together, row)
-        singles = [ask(lock, row[i : i + 1]) for i, lock in enumerate(alone)]
-        assert v.rate.tolist() == [s.rate[0] for s in singles]
-        assert v.kinds == tuple(s.kinds[0] for s in singles)
 
 
 def test_after_a_resume_a_reactor_is_stale_only_once_it_had_its_chance() -> None:

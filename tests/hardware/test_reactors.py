@@ -240,17 +240,6 @@ def test_targets_changed_by_someone_are_set_back() -> None:
     assert sum("set back to" in row["note"] for row in lab.of("note")) == 4
 
 
-def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
-    lab = begun(rate=0.0, minutes=3)
-    lab.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.008")
-    lab.device.handle("POST", "/SetOutputOn/Pump1/1/M0")
-    lab.run(4)
-    assert "pump" in lab.kinds()
-    assert len(doses(lab)) <= 2
-    assert lab.motors_off()
-    assert lab.reactors.stations[0].book.fault is None
-
-
 def test_a_pump_that_no_command_reaches_is_reported() -> None:
     lab = begun(stop_s=10.0, rate=0.02)
     while not lab.step().rows.any():

@@ -96,15 +96,6 @@ def test_a_torn_line_is_cut_and_a_torn_header_begun_anew(tmp_path: Path, torn: b
     assert path.read_bytes() == header + line * (kept + 1)
 
 
-@pytest.mark.parametrize("content", ["time_min,od\n1,2\n", "my shopping list"])
-def test_foreign_files_are_left_alone(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "run.csv"
-    path.write_text(content)
-    with pytest.raises(RecordingError, match="choose another file"):
-        Recorder(path, COLUMNS)
-    assert path.read_text() == content
-
-
 def test_misuse_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No such file"):
         Recorder(tmp_path / "absent" / "run.csv", COLUMNS)

@@ -27,16 +27,32 @@ def check_held(lab: DriverLab) -> None:
     assert 0.97 * (booked_ml - doubt_ml) <= true_ml <= 1.03 * booked_ml + 0.05
 
 
-def at(lab: DriverLab, after_s: float, *paths: str, pause_s: float = 0.0) -> None:
-    """Let a web page send these commands so long after the next sample, whatever the run does then."""
+def send(lab: DriverLab, after_s: float, *paths: str, pause_s: float = 0.0) -> None:
+    """Let a web page send these commands so long from now on, whatever the run does then."""
 
     def page() -> Iterator[float]:
         for path in paths:
             lab.device.handle("POST", path)
             yield pause_s
 
-    lab.step()
     lab.reactors._agenda.add(page(), after_s)
+
+
+def upon(lab: DriverLab, when: str, after_s: float, path: str) -> list[int]:
+    """Let a web page send this command once, so long after a request of the run; what is returned is empty then."""
+    left = [1]
+
+    def post(asked: str, real: Any) -> Reply:
+        reply: Reply = real(asked)
+        if asked.startswith(when) and left:
+            left.clear()
+            send(lab, after_s, path)
+            if when == WASTE_ON:
+                lab.reactors._agenda.run_due()
+        return reply
+
+    lab.on_post(post)
+    return left
 
 
 @pytest.mark.parametrize(("after_s", "times"), [(20.0, 1), (41.0, 1), (53.0, 1), (20.0, 2)])
@@ -45,7 +61,8 @@ def test_a_dose_from_the_web_page_is_booked_drained_and_told_once(after_s: float
     lab = lab_of()
     for _ in range(times):
         given = lab.truth()["feed_ml"]
-        at(lab, after_s, "/SetOutputTarget/Pump1/M0/0.08", "/SetOutputOn/Pump1/1/M0")
+        lab.step()
+        send(lab, after_s, "/SetOutputTarget/Pump1/M0/0.08", "/SetOutputOn/Pump1/1/M0")
         lab.run(3)
         assert lab.truth()["feed_ml"] > given + 4.0
     assert lab.truth()["volume_ml"] < 21.0
@@ -61,7 +78,8 @@ def test_a_dose_from_the_web_page_is_booked_drained_and_told_once(after_s: float
 def test_a_dose_from_the_web_page_that_nobody_saw_is_told_by_the_target_that_it_left() -> None:
     lab = lab_of()
     page = "/SetOutputTarget/Pump1/M0/0.04", "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0"
-    at(lab, 22.0, *page, pause_s=1.5)
+    lab.step()
+    send(lab, 22.0, *page, pause_s=1.5)
     lab.run(3)
     assert len(notes(lab, "Pump1 gave 0.00 to 2.62 mL without a dose")) == 1
     check_held(lab)
@@ -84,22 +102,7 @@ def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an
     when: str, after_s: float, path: str, told: bool
 ) -> None:
     lab = lab_of(rate=1.04 / 60.0)
-    left = [1]
-
-    def page() -> Iterator[float]:
-        lab.device.handle("POST", path)
-        yield from ()
-
-    def post(asked: str, real: Any) -> Reply:
-        reply: Reply = real(asked)
-        if asked.startswith(when) and left:
-            left.clear()
-            lab.reactors._agenda.add(page(), after_s)
-            if when == WASTE_ON:
-                lab.reactors._agenda.run_due()
-        return reply
-
-    lab.on_post(post)
+    upon(lab, when, after_s, path)
     lab.run(4)
     assert bool(notes(lab, "gave 0.00 to") or notes(lab, "gave 1.04 to") or notes(lab, "was repeated")) == told
     check_held(lab)
@@ -112,20 +115,7 @@ def test_a_feed_pump_switched_on_once_more_in_its_dose_gives_no_more_than_its_wi
 ) -> None:
     """The app shows the same as before, so nothing tells it: declared in docs/faults.md with this bound."""
     lab = lab_of(rate=0.62 / 60.0)
-    left = [1]
-
-    def page() -> Iterator[float]:
-        lab.device.handle("POST", f"{FEED_ON}M0")
-        yield from ()
-
-    def post(path: str, real: Any) -> Reply:
-        reply: Reply = real(path)
-        if path.startswith(FEED_ON) and left:
-            left.clear()
-            lab.reactors._agenda.add(page(), after_s)
-        return reply
-
-    lab.on_post(post)
+    left = upon(lab, FEED_ON, after_s, f"{FEED_ON}M0")
     lab.run(4)
     lab.clock.sleep(15.0)
     beyond_ml = lab.truth()["feed_ml"] - float(lab.loop.interlock.budget.fed_ml[0])
@@ -142,10 +132,6 @@ def test_a_feed_command_that_is_heard_in_a_later_dose_is_told_with_what_that_may
     lab = lab_of(rate=0.62 / 60.0)
     kept = [1]
 
-    def arrives() -> Iterator[float]:
-        lab.device.handle("POST", f"{FEED_ON}M0")
-        yield from ()
-
     def post(path: str, real: Any) -> Reply:
         if path.startswith(FEED_ON) and kept[-1] == 1:
             kept.append(2)
@@ -153,7 +139,7 @@ def test_a_feed_command_that_is_heard_in_a_later_dose_is_told_with_what_that_may
             raise LinkError("no answer")
         if path.startswith(landing[0]) and kept[-1] == 2 and lab.of("dose_end")[-1]["feed_ml"] == 0.0:
             kept.append(3)
-            lab.reactors._agenda.add(arrives(), landing[1])
+            send(lab, landing[1], f"{FEED_ON}M0")
         return real(path)
 
     lab.on_post(post)
@@ -198,7 +184,8 @@ def test_a_target_that_is_no_number_is_told_and_mended_before_it_costs_a_sample(
     lab = lab_of()
     if pump == "Pump4":
         lab.device.apps["M0"].data[pump]["record"].append(math.nan)
-    at(lab, after_s, f"/SetOutputTarget/{pump}/M0/nan")
+    lab.step()
+    send(lab, after_s, f"/SetOutputTarget/{pump}/M0/nan")
     lab.run(3)
     assert len(notes(lab, f"{pump} was set to no number by somebody and was set to 0")) == 1
     assert len(notes(lab, "restart the device's software")) == spread

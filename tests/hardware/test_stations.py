@@ -315,9 +315,7 @@ def test_every_culture_fits_its_own_vial(bench: Bench, words: str | None) -> Non
         chibio.FAMILY.doses(backend, bench)
 
 
-def test_pumps_are_measured_where_both_of_a_reactor_were_weighed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pumps_are_measured_where_both_of_a_reactor_were_weighed(monkeypatch: pytest.MonkeyPatch) -> None:
     dated = PumpCalibration(date="2026-02-03")
     found = [ReactorCalibration(dated, dated), ReactorCalibration(dated), ReactorCalibration(waste=dated)]
     monkeypatch.setattr(chibio, "load_calibrations", lambda *_given: found)

@@ -13,34 +13,17 @@ from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.emulator_lab import quiet
 
 
-def until(lab: DriverLab, seconds: float, what: Any) -> bool:
-    """Let device time pass in small steps until something holds; whether it did."""
-    for _ in range(int(seconds / 0.1)):
+def test_a_flag_that_a_stopped_measurement_left_holds_no_start_up() -> None:
+    """Somebody stopped the experiment in the five seconds of a measurement: its flag stays 1."""
+    lab = DriverLab(options=quiet(mu=0.025))
+    data = lab.device.apps["M0"].data["OD"]
+    lab.device.handle("POST", "/Experiment/1/M0")
+    while not data["Measuring"]:
         lab.clock.sleep(0.1)
         lab.device.run_until(lab.clock.now())
-        if what():
-            return True
-    return False
-
-
-def measuring(lab: DriverLab, name: str = "M0") -> bool:
-    return bool(lab.device.apps[name].data["OD"]["Measuring"])
-
-
-def left_measuring(names: tuple[str, ...] = ("M0",), **options: Any) -> DriverLab:
-    """A device whose experiment somebody stopped in the five seconds of a measurement: its flag stays 1."""
-    lab = DriverLab(names, options=quiet(mu=0.025), **options)
-    for name in names:
-        lab.device.handle("POST", f"/Experiment/1/{name}")
-    assert until(lab, 90.0, lambda: measuring(lab))
     lab.device.handle("POST", "/Experiment/0/M0")
     lab.clock.sleep(120.0)
-    assert measuring(lab)
-    return lab
-
-
-def test_a_flag_that_a_stopped_measurement_left_holds_no_start_up() -> None:
-    lab = left_measuring()
+    assert data["Measuring"]
     lab.reactors.begin()
     assert lab.device.apps["M0"].data["Experiment"]["ON"] == 1
     lab.run(5)
@@ -175,10 +158,22 @@ def test_a_resumed_run_goes_on_with_the_others_while_one_is_absent(caplog: pytes
     assert lab.samples[1] > before[1]
 
 
-def test_a_resumed_run_whose_reactors_are_all_out_of_reach_ends_with_what_it_could_not_verify() -> None:
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_resumed_run_whose_reactors_are_all_out_of_reach_ends_with_what_it_could_not_verify(stopped: bool) -> None:
+    """Also where it is stopped."""
     lab = begun(("M0", "M1"), options=quiet(mu=0.025), minutes=3)
-    lab.fault("lost_request", -1)
-    with pytest.raises(DeviceStateError, match=r"no answer.*pumps not verified off: M0: .*; M1: .*by hand now"):
+    lab.fault("lost_request", 0 if stopped else -1)
+
+    def post(path: str, real: Any) -> Reply:
+        if stopped:
+            lab.on_post(lambda path, _: real(path))
+            lab.fault("lost_request", -1)
+            raise KeyboardInterrupt
+        return real(path)
+
+    lab.on_post(post)
+    why = "stopped" if stopped else "no answer"
+    with pytest.raises(DeviceStateError, match=rf"{why}.*pumps not verified off: M0: .*; M1: .*by hand now"):
         lab.resume()
 
 
@@ -211,21 +206,6 @@ def test_a_stop_while_a_killed_run_is_resumed_leaves_its_pump_off(
     assert "pumps verified off" in caplog.text
     lab.clock.sleep(200.0)
     assert lab.motors_off()
-
-
-def test_a_stop_while_a_run_is_resumed_over_a_dead_link_says_that_it_could_not_verify(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    lab = begun(options=quiet(mu=0.025), minutes=2)
-
-    def stopped(path: str) -> Reply:
-        monkeypatch.undo()
-        lab.fault("lost_request", -1)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(lab.wire.inner, "post", stopped)
-    with pytest.raises(DeviceStateError, match=r"stopped; pumps not verified off: M0"):
-        lab.resume()
 
 
 def test_one_time_out_now_and_then_rests_no_reactor():
