@@ -28,6 +28,7 @@ from tests.hardware.test_board_agent import TOKEN, AgentLab, Recorder, make_toke
 from tests.hardware.test_http_transport import Server
 from tests.patience import PATIENCE_S
 
+Door, Linked = tuple[Proxy, Recorder], tuple[str, TransportConfig]
 PUMP = "/SetOutputOn/Pump1/1/M0"
 BEARER = f"Authorization: Bearer {TOKEN}"
 
@@ -127,7 +128,7 @@ def test_reading_needs_the_token_too_and_a_preflight_opens_nothing(guarded: Http
     assert (status, "access-control" in head) == (405, False)
 
 
-def test_what_is_refused_is_no_sign_of_life(door: tuple[Proxy, Recorder]) -> None:
+def test_what_is_refused_is_no_sign_of_life(door: Door) -> None:
     proxy, _ = door
     port, agent = proxy.server_address[1], proxy.agent
     assert ask(port, "POST", "/x", BEARER, "X-Session: 1")[0] == 204
@@ -192,7 +193,7 @@ def close(proxy: Proxy) -> None:
 
 
 @pytest.fixture
-def door() -> Iterator[tuple[Proxy, Recorder]]:
+def door() -> Iterator[Door]:
     device = Recorder()
     proxy = serve(BoardAgent(device, 600.0))
     yield proxy, device
@@ -247,7 +248,7 @@ POST = b"POST /x HTTP/1.1\r\n" + GOOD
     ],
 )
 def test_what_is_no_plain_request_gets_one_clean_answer(
-    door: tuple[Proxy, Recorder], data: bytes, status: int, capfd: pytest.CaptureFixture[str]
+    door: Door, data: bytes, status: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
     proxy, device = door
     port = proxy.server_address[1]
@@ -260,7 +261,7 @@ def test_what_is_no_plain_request_gets_one_clean_answer(
     assert capfd.readouterr().err == ""
 
 
-def test_names_and_addresses_of_the_board(door: tuple[Proxy, Recorder]) -> None:
+def test_names_and_addresses_of_the_board(door: Door) -> None:
     port = door[0].server_address[1]
     for host in ("localhost", "LOCALHOST:80", "127.0.0.1", "board.local:5001", "Board.Local"):
         assert ask(port, "GET", "/x", BEARER, host=host)[0] == 204, host
@@ -268,9 +269,7 @@ def test_names_and_addresses_of_the_board(door: tuple[Proxy, Recorder]) -> None:
         assert ask(port, "GET", "/x", BEARER, host=host)[0] == 403, host
 
 
-def test_who_dribbles_is_sent_away_and_keeps_nobody_out(
-    door: tuple[Proxy, Recorder], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_dribbles_keeps_nobody_out(door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
     port = door[0].server_address[1]
 
     def dribbling(count: int, head_s: float) -> list[socket.socket]:
@@ -296,9 +295,7 @@ def test_who_dribbles_is_sent_away_and_keeps_nobody_out(
     AgentLab.until(lambda: ask(port, "GET", "/x", BEARER)[0] == 204)
 
 
-def test_a_connection_that_is_cut_at_any_point_leaves_no_trace(
-    door: tuple[Proxy, Recorder], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_connection_that_is_cut_leaves_no_trace(door: Door, capfd: pytest.CaptureFixture[str]) -> None:
     port = door[0].server_address[1]
     whole = POST + b"Content-Length: 0\r\n\r\n"
     for end in (0, 1, 20, len(whole) - 1):
@@ -343,16 +340,14 @@ def test_where_nothing_was_switched_off_nothing_is_said() -> None:
 
 
 @pytest.fixture
-def linked(
-    door: tuple[Proxy, Recorder], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> tuple[str, TransportConfig]:
+def linked(door: Door, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Linked:
     """The agent's address and the config of a client that knows its token, on a computer of its own."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return f"http://127.0.0.1:{door[0].server_address[1]}", TransportConfig(token_file=str(make_token(tmp_path)))
 
 
 def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
-    door: tuple[Proxy, Recorder], linked: tuple[str, TransportConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    door: Door, linked: Linked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url, config = linked
     with open_transport(config, url) as first:
@@ -374,9 +369,7 @@ def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
 # -- the client's side of the token ----------------------------------------------------------------------------------
 
 
-def test_a_client_without_the_right_token_is_told_what_to_do(
-    linked: tuple[str, TransportConfig], tmp_path: Path
-) -> None:
+def test_a_client_without_the_token_is_told_what_to_do(linked: Linked, tmp_path: Path) -> None:
     url, _ = linked
     bare = HttpTransport(url)
     with pytest.raises(LinkError, match="no or wrong token.*backend.transport.token_file"):

@@ -103,9 +103,7 @@ def test_a_sample_is_stalled_by_the_age_that_is_set_and_a_restart_by_another() -
 
 
 @pytest.mark.parametrize(("on", "target", "as_left"), [(1, 0.5, True), (1, 0.503, False), (0, 0.5, False)])
-def test_a_device_regulates_at_the_setpoint_it_was_left_with_and_at_no_other(
-    on: int, target: float, as_left: bool
-) -> None:
+def test_a_device_regulates_at_the_setpoint_it_was_left_with_alone(on: int, target: float, as_left: bool) -> None:
     found = read(OD__ON=on, OD__target=target)
     assert regulates(found, 0.5) is as_left
     assert not regulates(found, math.nan)

@@ -47,7 +47,7 @@ def _no_descriptor_is_left() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("data", ["µ = 0.04\n", b"\x00\xff", ""])
-def test_an_atomic_file_is_written_whole_or_not_at_all(
+def test_an_atomic_file_is_whole_or_unwritten(
     tmp_path: Path, data: bytes | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, whole = tmp_path / "s", data.encode() if isinstance(data, str) else data
@@ -73,9 +73,7 @@ def test_an_atomic_file_is_synced_before_it_takes_its_place_and_its_name_after(t
     assert tape == [("fsync", "s.part", 3), ("replace", "s.part", "s"), ("fsync", ".")]
 
 
-def test_a_file_that_two_write_at_once_is_whole_and_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_two_write_at_once_is_whole_without_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second writer comes and goes between the data of the first and its name; then one whose disk refuses."""
     real = os.replace
 

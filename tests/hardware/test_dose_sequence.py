@@ -135,9 +135,7 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
         (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "what it did is looked for: no answer"),
     ],
 )
-def test_a_pump_command_whose_answer_is_lost_is_not_sent_again(
-    lost: str, sent: list[str], fed_ml: float, words: str
-) -> None:
+def test_a_pump_command_without_an_answer_is_sent_once(lost: str, sent: list[str], fed_ml: float, words: str) -> None:
     bench = Bench()
     bench.line.lost = {lost}
     assert bench.begin().feed_ml == fed_ml

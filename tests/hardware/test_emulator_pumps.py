@@ -177,9 +177,7 @@ def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(overflow_pump: str, lev
         ("back_leak_ml", 0.2, [0.8, 1.6]),  # from every pulse
     ],
 )
-def test_pump_faults_change_what_arrives_not_what_the_device_says(
-    fault: str, value: float, delivered: list[float]
-) -> None:
+def test_pump_faults_change_what_arrives_not_what_is_said(fault: str, value: float, delivered: list[float]) -> None:
     lab = Lab()
     inject(lab.device, fault, "M0", value)
     lab.pump("Pump1", (1.0 - BIAS_S) / 63.0)

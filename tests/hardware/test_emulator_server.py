@@ -236,7 +236,7 @@ def test_a_port_in_use_gives_one_line(emulator: Served, capfd: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("program", ["emulator", "rig"])
-def test_a_wrong_word_is_two_lines_and_help_says_all(
+def test_a_wrong_word_is_two_lines_help_says_all(
     program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def said(word: str) -> tuple[str, str]:

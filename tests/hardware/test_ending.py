@@ -72,7 +72,7 @@ def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None
         (119.9, 123.2, 1.2, 1.2),
     ],
 )
-def test_a_dose_that_was_cut_short_lies_between_two_volumes(
+def test_a_dose_cut_short_lies_between_two_volumes(
     answered_s: float, off_s: float, most_ml: float, least_ml: float
 ) -> None:
     known = replace(OPEN, feed_on=(100.0, answered_s), feed_off=(off_s, off_s + 0.1), waste_off=(130.0, 130.1))
@@ -85,7 +85,7 @@ def test_a_dose_that_was_cut_short_lies_between_two_volumes(
     ("on_s", "times", "last_ml"),
     [(62.9, 0, 0.0), (63.5, 1, 0.5), (64.2, 1, 1.2), (125.9, 1, 1.2), (126.3, 2, 0.3), (900.0, 14, 1.2)],
 )
-def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
+def test_a_pump_left_on_repeats_every_63_s_and_its_last_dose_may_be_cut(
     on_s: float, times: int, last_ml: float
 ) -> None:
     ending, words = after(OPEN, read(True, True), 100.0 + on_s)
@@ -299,12 +299,15 @@ def test_every_dose_of_a_journal_in_the_order_of_time() -> None:
         intent(6, "M1", 72.0), {"n": 7, "kind": "feed_on", "reactor": "M1", "on_s": 73.0},
         {"n": 8, "kind": "dose_end", "reactor": "M0", **Ending(71.0, 1.2, 9.0, 1, 2, waste_last_ml=3.0).row()},
         intent(9, "M0", 300.0, feed_pump="Pump3"), {"n": 10, "kind": "feed_on", "reactor": "M0", "on_s": 301.0},
-        {"n": 11, "kind": "dose_end", "reactor": "M0", **Ending(301.0, 1.2, 9.0, 1, 1, pump=3).row()},
+        {"n": 11, "kind": "dose_end", "reactor": "M0", **Ending(301.0, 1.2, 9.0, 2, 0, 3, 0.2).row()},
+        intent(12, "M2", 74.0), {"n": 13, "kind": "feed_on", "reactor": "M2", "on_s": 75.0},
+        {"n": 14, "kind": "dose_end", "reactor": "M2", **Ending(75.0, 1.2, 9.0, 1, 1).row()},
     ]  # fmt: skip
     assert [(d.n, d.reactor, d.at_s, d.feed_ml, d.waste_ml, d.again, d.pump) for d in dosed(rows)] == [
         (0, "M0", 11.0, 0.7, 9.0, False, 1), (4, "M0", 71.0, 1.2, 9.0, False, 1), (6, "M1", 72.0, 1.2, 9.0, False, 1),
-        (8, "M0", 134.0, 1.2, 9.0, True, 1), (8, "M0", 197.0, 0.0, 3.0, True, 1),
-        (9, "M0", 301.0, 1.2, 9.0, False, 3), (11, "M0", 364.0, 1.2, 9.0, True, 3),
+        (12, "M2", 75.0, 1.2, 9.0, False, 1), (8, "M0", 134.0, 1.2, 9.0, True, 1), (14, "M2", 138.0, 1.2, 9.0, True, 1),
+        (8, "M0", 197.0, 0.0, 3.0, True, 1), (9, "M0", 301.0, 1.2, 9.0, False, 3), (11, "M0", 364.0, 1.2, 0.0, True, 3),
+        (11, "M0", 427.0, 0.2, 0.0, True, 3),
     ]  # fmt: skip
     assert replay(rows)["M1"].fed
     assert not replay(rows[:3])["M1"].fed

@@ -76,9 +76,7 @@ def test_simulated_reactors_measure_it_where_the_plant_fluoresces() -> None:
     ("command", "seen"),
     [(COMMAND, True), (COMMAND.replace("LEDA", "LEDD"), False), (COMMAND.replace("nm440", "nm510"), False)],
 )
-def test_the_device_shows_emissions_over_the_base_and_a_pigment_in_its_own_light_alone(
-    command: str, seen: bool
-) -> None:
+def test_the_device_shows_emissions_over_the_base_and_a_pigment_in_its_light_alone(command: str, seen: bool) -> None:
     emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5, temperature=33.0)
     assert emulated.post("/changeDevice/M0") == emulated.post(command) == emulated.post("/MeasureFP/M0") == 204
     fp, plant = emulated.state()["FP1"], emulated.device.vials["M0"].plant
@@ -161,7 +159,7 @@ def test_each_reactor_s_own_slot_is_switched() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "toggled", "found"), [("ON", 0, 1, "off"), ("LED", "LEDB", 2, "set to LEDB, CLEAR, nm440, x10")]
 )
-def test_what_somebody_changes_is_put_right_in_one_go_and_the_old_value_not_shown(
+def test_what_somebody_changes_is_put_right_at_once_and_not_shown(
     key: str, value: Any, toggled: int, found: str
 ) -> None:
     bench = begun()

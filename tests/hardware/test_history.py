@@ -79,26 +79,6 @@ def test_a_resumed_run_knows_when_a_unit_was_started_and_which_task_a_dose_was()
     assert units([*rows, row(4, "task", "pio01", id="run/0", job="remove_waste", task="w0")])["pio01"].task == "a1"
 
 
-def test_repetitions_of_a_spare_pump_s_dose_are_by_that_pump_not_by_the_feed() -> None:
-    """Pump3 gave 0.5 mL, and again twice; the feed of the other reactor once more."""
-    rows = [
-        row(1, "intent", **INTENT | {"feed_pump": "Pump3"}, on_s=75.0),
-        row(2, "feed_on", on_s=76.0),
-        row(3, "intent", "M1", **INTENT, on_s=77.0),
-        row(4, "feed_on", "M1", on_s=78.0),
-        row(5, "dose_end", **Ending(76.0, 0.5, 6.0, 2, 0, 3, 0.2).row()),
-        row(6, "dose_end", "M1", **Ending(78.0, 0.5, 6.0, 1, 1).row()),
-    ]
-    told = [(one.reactor, one.pump, one.again, one.at_s, one.feed_ml, one.waste_ml) for one in dosed(rows)]
-    assert told == [
-        ("M0", 3, False, 76.0, 0.5, 6.0),
-        ("M1", 1, False, 78.0, 0.5, 6.0),
-        ("M0", 3, True, 139.0, 0.5, 0.0),
-        ("M1", 1, True, 141.0, 0.5, 6.0),
-        ("M0", 3, True, 202.0, 0.2, 0.0),
-    ]
-
-
 def test_what_later_rows_say_of_a_dose() -> None:
     rows = [row(1, "intent", **INTENT, on_s=75.0), row(2, "feed_on", on_s=76.0)]
     off = row(3, "command", path="/SetOutputOn/Pump1/0/M0", answer=204)

@@ -238,9 +238,7 @@ def fuzzed() -> Iterator[Server]:
 
 @settings(max_examples=FUZZ_CASES, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(pieces=st.lists(PIECES, max_size=6), whole=st.booleans())
-def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
-    fuzzed: Server, pieces: list[bytes], whole: bool
-) -> None:
+def test_fuzz_whatever_comes_back_is_an_answer_or_our_error(fuzzed: Server, pieces: list[bytes], whole: bool) -> None:
     """A read of a device that answers anything: a verified state or a ReactorError, never another exception."""
     garbage = (b"HTTP/1.1 200 OK\r\n" if whole else b"") + b"".join(pieces)
     fuzzed.behave = lambda c, request: c.sendall(OK if request.startswith(b"POST /changeDevice") else garbage)

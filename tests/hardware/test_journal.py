@@ -80,7 +80,7 @@ def test_a_missing_folder_or_file_says_what_to_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["write", "fsync"])
-def test_a_stop_within_a_row_neither_cuts_nor_doubles_it(
+def test_a_stop_in_a_row_neither_cuts_nor_doubles_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     """The stop comes when the row is written and not yet counted; the disk takes only a part of the row after it."""
@@ -106,9 +106,7 @@ def test_a_stop_within_a_row_neither_cuts_nor_doubles_it(
     assert [(row["n"], row["kind"]) for row in rows] == [(0, "first"), (1, "stopped"), (2, "last")]
 
 
-def test_a_run_began_with_the_first_row_of_its_journal_however_often_it_was_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_began_with_its_first_row_however_often_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows at 1000 s and, of a second life, at 5000 s; looked at again at 8000 s."""
     monkeypatch.setattr("time.time", lambda: 8000.0)
     new = Journal(tmp_path / "j", fsync=False)

@@ -296,9 +296,7 @@ def test_a_blocked_waste_tube_at_the_largest_feed(pump: OverflowPumpConfig, peak
 
 
 @pytest.mark.parametrize(("flow_ml_s", "overflows"), [(1.0, True), (1.2, False)])
-def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
-    flow_ml_s: float, overflows: bool
-) -> None:
+def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_stronger(flow_ml_s: float, overflows: bool) -> None:
     """0.95 of the time at the feed pump's own 1 mL/s is less than the feed: the headroom is gone in minutes."""
     pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")

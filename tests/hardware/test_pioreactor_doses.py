@@ -504,9 +504,7 @@ def test_a_dose_of_the_alt_media_pump_is_followed_booked_as_pump_3_and_wasted_as
 
 
 @pytest.mark.parametrize("away_s", [0.2, 30.0])
-def test_a_dose_of_the_alt_media_pump_in_which_the_program_is_killed_is_booked_and_not_sent_again(
-    monkeypatch, two, away_s
-):
+def test_a_dose_of_alt_media_in_which_the_program_is_killed_is_booked_and_sent_once(monkeypatch, two, away_s):
     two.dose(0.9, pump=3)
     two.until(lambda: ALT_PIN in two.world.since, 10.0)
     again, world = two.resumed(monkeypatch, away_s, 60.0, alt_media=True), two.world

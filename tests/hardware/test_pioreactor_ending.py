@@ -257,9 +257,7 @@ def test_every_way_back(monkeypatch, name, version, stirring):
 
 
 @pytest.mark.parametrize(("waste_ml_s", "bottle_ml", "least"), [(1.6, 30.0, 54.0), (FLOW["add_media"], 120.0, 100.0)])
-def test_while_a_media_pump_cannot_be_stopped_the_vial_is_drained_up_to_a_bound(
-    monkeypatch, waste_ml_s, bottle_ml, least
-):
+def test_while_a_media_pump_runs_on_the_vial_is_drained_up_to_a_bound(monkeypatch, waste_ml_s, bottle_ml, least):
     monkeypatch.setitem(FLOW, "remove_waste", waste_ml_s)
     lab = sampled(monkeypatch, bottle_ml=bottle_ml)
     lab.world.kill_after_s = 0.2
@@ -277,9 +275,7 @@ def test_while_a_media_pump_cannot_be_stopped_the_vial_is_drained_up_to_a_bound(
 
 @pytest.mark.parametrize("waste_ml_s", [1.6, FLOW["add_media"]])
 @pytest.mark.parametrize("volume_ml", [14.0, 20.0])
-def test_a_pump_that_cannot_be_stopped_is_booked_as_it_flows_and_spills_no_more_than_a_dose(
-    monkeypatch, waste_ml_s, volume_ml
-):
+def test_a_pump_that_runs_on_is_booked_as_it_flows_and_spills_no_more_than_a_dose(monkeypatch, waste_ml_s, volume_ml):
     """Up to 60 mL, also where the waste pump is no stronger than the media pump."""
     monkeypatch.setitem(FLOW, "remove_waste", waste_ml_s)
     lab = sampled(monkeypatch, volume_ml=volume_ml)

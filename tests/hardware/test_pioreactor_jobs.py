@@ -42,9 +42,7 @@ def started(lab, job):
     ("version", "forget"), [("26.7.2", "pio jobs purge --job-name {}, else reboot"), ("25.11.19", "reboot")]
 )
 @pytest.mark.parametrize(("job", "said"), [("stirring", "does not stir"), ("temperature_automation", "does not heat")])
-def test_what_a_reboot_ended_is_started_again_named_with_what_helps_and_nothing_is_dosed_without_it(
-    monkeypatch, version, forget, job, said
-):
+def test_what_a_reboot_ended_is_named_started_again_and_holds_doses(monkeypatch, version, forget, job, said):
     """By what its version knows against it."""
     lab = sampled(monkeypatch, World(version), stirring=True, thermostat=True)
     lab.world.barred = True

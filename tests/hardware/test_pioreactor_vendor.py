@@ -93,9 +93,7 @@ def test_a_sample_is_the_culture_s_and_a_dose_reaches_it_once_and_as_much_leaves
 
 
 @pytest.mark.parametrize("at_its_end", [False, True])
-def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_its_pump_is_off(
-    bench, monkeypatch, at_its_end
-):
+def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_it_is_off(bench, monkeypatch, at_its_end):
     bench.kill_a_dose(monkeypatch, at_its_end)
     assert bench.sample()
     assert bench.dose(3.0) == 3.0

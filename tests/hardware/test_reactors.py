@@ -158,7 +158,7 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
 
 @pytest.mark.parametrize("named", [0, 1])
 @pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True), (0.0, True)])
-def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_ended(
+def test_a_stopped_experiment_is_started_at_once_if_it_is_said_to_be_over(
     named: int, rest_s: float, waits: bool
 ) -> None:
     """Newer apps name the reactor in the line that says so. Before that its last cycle would end the new one's heat."""

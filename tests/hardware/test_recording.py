@@ -17,6 +17,7 @@ from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
 from tests.real_recording import DITHER, needs_dither
 
+Read = Callable[..., Recording]
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")
 T = np.arange(40.0)
 OD = 0.1 * np.exp(0.02 * T)
@@ -58,7 +59,7 @@ def changed(values: np.ndarray, where: object, to: object) -> np.ndarray:
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., Recording]:
+def read(tmp_path: Path) -> Read:
     def write_and_read(content: str | bytes, **options: Any) -> Recording:
         path = tmp_path / "recording.csv"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -129,7 +130,7 @@ def test_misuse_is_named(tmp_path: Path) -> None:
         pytest.param(tidy(t=T / 60, header="time_h,od,pump_rate"), id="hours"),
     ],
 )
-def test_every_layout_reads_alike(read: Callable[..., Recording], content: str) -> None:
+def test_every_layout_reads_alike(read: Read, content: str) -> None:
     r = read(content)
     np.testing.assert_allclose(r.time_min, T)
     np.testing.assert_allclose(r.od, OD)
@@ -137,14 +138,14 @@ def test_every_layout_reads_alike(read: Callable[..., Recording], content: str) 
     assert r.notes == ()
 
 
-def test_pump_flow_turns_duty_into_rate_but_leaves_rates_alone(read: Callable[..., Recording]) -> None:
+def test_pump_flow_turns_duty_into_rate_but_leaves_rates_alone(read: Read) -> None:
     duty = read(chibio(**FED), pump_ml_s=0.8)
     np.testing.assert_allclose(duty.pump_rate, 0.8 * U)
     np.testing.assert_allclose(duty.temperature, 37.0 + 0.01 * T)
     np.testing.assert_allclose(read(tidy(), pump_ml_s=0.8).pump_rate, U)
 
 
-def test_another_pump_that_ran_is_not_counted_unless_it_is_asked_for(read: Callable[..., Recording]) -> None:
+def test_another_pump_that_ran_is_not_counted_unless_it_is_asked_for(read: Read) -> None:
     assert read(chibio(pump_3_rate=U)).pump_rate.max() == 0.0
     both = read(chibio(pump_1_rate=U, pump_2_rate=4 * U, pump_3_rate=0.5 * U), pumps=(1, 3))
     np.testing.assert_allclose(both.pump_rate, 1.5 * U)
@@ -174,7 +175,7 @@ def test_a_mark_is_one_that_measures_where_a_level_or_a_share_was(tmp_path: Path
     assert read_marks(tmp_path) == [replace(marks[0], time_min=12.346), *marks[1:]]
 
 
-def test_a_file_cut_by_a_power_loss_is_read_up_to_there(read: Callable[..., Recording]) -> None:
+def test_a_file_cut_by_a_power_loss_is_read_up_to_there(read: Read) -> None:
     """The file system leaves a block of NUL bytes; rows written after the restart follow it on the same line."""
     lines = tidy().splitlines(keepends=True)
     cut = read("".join(lines).encode() + bytes(3000))
@@ -185,7 +186,7 @@ def test_a_file_cut_by_a_power_loss_is_read_up_to_there(read: Callable[..., Reco
     assert any("line 21: holds control characters" in n for n in went_on.notes)
 
 
-def test_only_the_asked_rows_are_judged(read: Callable[..., Recording]) -> None:
+def test_only_the_asked_rows_are_judged(read: Read) -> None:
     """A pump run backwards to flush the tubing at the end does not condemn the rows before."""
     flushed = tidy(u=changed(U, slice(35, 40), -0.02))
     with pytest.raises(RecordingError, match="row 35: pump rate -0.02"):
@@ -211,7 +212,7 @@ def test_real_chibio_file() -> None:
 
 
 @pytest.mark.parametrize("header", [",".join(COLUMNS), ""])
-def test_concatenated_runs(read: Callable[..., Recording], header: str) -> None:
+def test_concatenated_runs(read: Read, header: str) -> None:
     short = tidy(OD[:12], T[:12], U[:12], header)
     longest = read(short + tidy(header=header) + short)
     assert longest.row.tolist() == list(range(12, 52))
@@ -226,7 +227,7 @@ def test_concatenated_runs(read: Callable[..., Recording], header: str) -> None:
         assert read(tidy() + tidy(OD[:3], T[:3], U[:3]) + f"{header}\n").runs == ((0, 39), (40, 42))
 
 
-def test_one_reactor_of_several(read: Callable[..., Recording]) -> None:
+def test_one_reactor_of_several(read: Read) -> None:
     lines = [f"{m},{t!r},{y + 0.1 * m!r},0.0" for t, y in zip(T.tolist(), OD.tolist(), strict=True) for m in (0, 1)]
     content = "\n".join(["reactor,time_min,od,pump_rate_ml_s", *lines]) + "\n"
     np.testing.assert_allclose(read(content, reactor="1").od, OD + 0.1)
@@ -258,7 +259,7 @@ def test_one_reactor_of_several(read: Callable[..., Recording]) -> None:
     ],
 )
 def test_unusable_readings_are_missing_unusable_rows_dropped_and_both_reported(
-    read: Callable[..., Recording], content: str, missing: list[int], dropped: list[int], note: str
+    read: Read, content: str, missing: list[int], dropped: list[int], note: str
 ) -> None:
     r = read(content)
     assert r.row.max() < 40
@@ -295,9 +296,7 @@ def test_unusable_readings_are_missing_unusable_rows_dropped_and_both_reported(
         pytest.param(tidy(u=1200 * U), "pump rate 24 mL/s.*mL/min", id="pump-unit"),
     ],
 )
-def test_what_is_no_recording_is_refused_in_one_line(
-    read: Callable[..., Recording], content: str | bytes, message: str
-) -> None:
+def test_what_is_no_recording_is_refused_in_one_line(read: Read, content: str | bytes, message: str) -> None:
     with pytest.raises(RecordingError, match=message) as caught:
         read(content)
     assert "\n" not in str(caught.value)
@@ -309,7 +308,7 @@ def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
             read_recording(tmp_path / name, pump_ml_s=flow)
 
 
-def test_fluorescence_is_read_where_it_was_measured(read: Callable[..., Recording]) -> None:
+def test_fluorescence_is_read_where_it_was_measured(read: Read) -> None:
     counts = 1000.0 + 5.0 * np.arange(len(T))
     own = ["time_min,od,pump_rate_ml_s,interlock,fluorescence"]
     own += [
@@ -321,7 +320,7 @@ def test_fluorescence_is_read_where_it_was_measured(read: Callable[..., Recordin
     assert np.isnan(read(tidy()).fluorescence).all()
 
 
-def test_the_device_s_own_file_gives_base_times_emission(read: Callable[..., Recording]) -> None:
+def test_the_device_s_own_file_gives_base_times_emission(read: Read) -> None:
     base = changed(np.full(len(T), 20000.0), 3, 0.0)  # switched off in the fourth cycle
     found = read(chibio(FP1_base=base, FP1_emit1=changed(np.full(len(T), 0.1), 3, 0.0))).fluorescence
     np.testing.assert_allclose(found, changed(np.full(len(T), 2000.0), 3, np.nan))
@@ -378,7 +377,7 @@ COMMAS = "commas are read as decimal points"
         ),
     ],
 )
-def test_one_recording_in_many_clothes(read: Callable[..., Recording], content: str | bytes, note: str | None) -> None:
+def test_one_recording_in_many_clothes(read: Read, content: str | bytes, note: str | None) -> None:
     r = read(content)
     np.testing.assert_allclose(r.time_min, SLOW_T, atol=1e-6)
     np.testing.assert_array_equal(r.od, KNOWN_OD)
@@ -386,12 +385,12 @@ def test_one_recording_in_many_clothes(read: Callable[..., Recording], content: 
     assert [n.split(":")[0] for n in r.notes] == [n for n in [note] if n]
 
 
-def test_a_time_without_unit_is_refused(read: Callable[..., Recording]) -> None:
+def test_a_time_without_unit_is_refused(read: Read) -> None:
     with pytest.raises(RecordingError, match="column time holds 0 to 118, neither dates nor .*time_min, time_s or"):
         read(known(header="time,od,pump_rate"))
 
 
-def test_a_clock_that_was_not_yet_set_costs_its_rows(read: Callable[..., Recording]) -> None:
+def test_a_clock_that_was_not_yet_set_costs_its_rows(read: Read) -> None:
     """Single rows that count from 1970 among dates, or that hold a date among minutes, do not part the recording."""
     unset = read(known([*IN_MS[:2], 5000, *IN_MS[3:]], "time,od,pump_rate"))
     np.testing.assert_allclose(unset.time_min, np.delete(SLOW_T, 2), atol=1e-6)
@@ -401,7 +400,7 @@ def test_a_clock_that_was_not_yet_set_costs_its_rows(read: Callable[..., Recordi
     assert len(dated.runs) == 1
 
 
-def test_a_quoted_cell_may_hold_the_separator_and_a_stray_quote_costs_one_row(read: Callable[..., Recording]) -> None:
+def test_a_quoted_cell_may_hold_the_separator_and_a_stray_quote_costs_one_row(read: Read) -> None:
     lines = known(header="").splitlines()
     quoted = ["note,time_min,od,pump_rate", *(f'"fed, then ""rested""",{line}' for line in lines)]
     np.testing.assert_array_equal(read("\n".join(quoted) + "\n").od, KNOWN_OD)
@@ -413,7 +412,7 @@ def test_a_quoted_cell_may_hold_the_separator_and_a_stray_quote_costs_one_row(re
 
 @pytest.mark.parametrize("lost", [3, 4, 29])
 @pytest.mark.parametrize("how", ["nan", "empty", "cut off", "cut off behind"])
-def test_rows_without_a_pump_rate_are_dropped_if_few(read: Callable[..., Recording], lost: int, how: str) -> None:
+def test_rows_without_a_pump_rate_are_dropped_if_few(read: Read, lost: int, how: str) -> None:
     """Of 60 rows three are 5 %."""
     lines = [line + ",0.5" * (how == "cut off behind") for line in known().splitlines()]
     for i in range(1, 2 * lost, 2):
@@ -430,7 +429,7 @@ def test_rows_without_a_pump_rate_are_dropped_if_few(read: Callable[..., Recordi
             read(content)
 
 
-def test_what_was_read_and_noted_stands_beside_a_refusal(read: Callable[..., Recording]) -> None:
+def test_what_was_read_and_noted_stands_beside_a_refusal(read: Read) -> None:
     lines = chibio(pump_3_rate=U, od_measured=np.full(len(T), np.nan)).splitlines()
     with pytest.raises(RecordingError, match=r"only 0 of 39 rows.*\(line 41: has no line end.*pump 3 ran and is not"):
         read("\n".join(lines))
@@ -452,7 +451,7 @@ def test_what_was_read_and_noted_stands_beside_a_refusal(read: Callable[..., Rec
     ],
 )
 def test_two_pumps_that_feed_are_told_from_feed_and_waste(
-    read: Callable[..., Recording], rates: dict[int, float], names: str | None, remedy: str
+    read: Read, rates: dict[int, float], names: str | None, remedy: str
 ) -> None:
     r = read(chibio(**{f"pump_{pump}_rate": share * U for pump, share in rates.items()}), pump_ml_s=0.8)
     np.testing.assert_allclose(r.pump_rate, 0.8 * rates.get(1, 0.0) * U)
@@ -463,9 +462,7 @@ def test_two_pumps_that_feed_are_told_from_feed_and_waste(
     assert [n for n in r.notes if f"pump {names} ran and is not counted" in n] == list(r.notes)
 
 
-def test_dates_without_an_offset_know_no_summer_time(
-    read: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dates_without_an_offset_know_no_summer_time(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
     time.tzset()
     try:
@@ -477,7 +474,7 @@ def test_dates_without_an_offset_know_no_summer_time(
     np.testing.assert_allclose(r.time_min, SLOW_T, atol=1e-6)
 
 
-def test_a_row_cut_off_before_its_reactor_is_noted(read: Callable[..., Recording]) -> None:
+def test_a_row_cut_off_before_its_reactor_is_noted(read: Read) -> None:
     lines = [f"{line},{'reactor' if not i else f'M{i % 2}'}" for i, line in enumerate(known().splitlines())]
     lines[5] = lines[5].rsplit(",", 2)[0]
     r = read("\n".join(lines) + "\n", reactor="M1")
@@ -485,15 +482,13 @@ def test_a_row_cut_off_before_its_reactor_is_noted(read: Callable[..., Recording
     assert r.notes[:2] == ("reactor M1 taken; the file also holds M0", "row 4: fewer than 4 columns: dropped")
 
 
-def test_a_reactor_that_is_not_there_is_named(read: Callable[..., Recording]) -> None:
+def test_a_reactor_that_is_not_there_is_named(read: Read) -> None:
     content = "reactor," + known().replace("\n", "\nM4,").removesuffix("M4,")
     with pytest.raises(RecordingError, match="reactor = M5: allowed is one of M4, which the file holds"):
         read(content, reactor="M5")
 
 
-def test_a_clock_that_restarts_parts_a_recording_whatever_stood_behind_it_before(
-    read: Callable[..., Recording],
-) -> None:
+def test_a_clock_that_restarts_parts_a_recording_whatever_stood_behind_it_before(read: Read) -> None:
     """Dense reference: rows that do not pass the latest time are stale, until five rise without passing it."""
     rng = np.random.default_rng(7)
     for _ in range(100):

@@ -93,9 +93,7 @@ def kept(lab: DriverLab, minutes: float) -> Callable[[], None]:
 
 @pytest.mark.parametrize("minutes", [4.0, 8.0])
 @pytest.mark.parametrize("command", ["/SetOutputOn/Pump1/1/M0", FEED_OFF])
-def test_commands_that_a_tunnel_delivers_late_are_booked_between_bounds_that_hold_the_truth(
-    command: str, minutes: float
-) -> None:
+def test_commands_that_a_tunnel_delivers_late_are_booked_between_true_bounds(command: str, minutes: float) -> None:
     lab = begun(options=quiet(mu=0.025), rate=0.015, minutes=4)
     began = False
 

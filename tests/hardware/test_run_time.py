@@ -65,9 +65,7 @@ def test_a_clock_that_was_set_moves_neither_the_run_nor_what_is_booked(
 
 
 @pytest.mark.parametrize("step_s", [-HOUR_S, HOUR_S])
-def test_without_a_device_that_tells_the_run_never_goes_back(
-    lab: Killed, monkeypatch: pytest.MonkeyPatch, step_s: float
-) -> None:
+def test_without_a_telling_device_no_run_goes_back(lab: Killed, monkeypatch: pytest.MonkeyPatch, step_s: float) -> None:
     newest_s = max(row["time_s"] for row in lab.rows)
     computer(monkeypatch, lab, step_s, "second")
     lab.device.handle("POST", "/Experiment/0/M0")

@@ -67,9 +67,7 @@ def cable(lab: DriverLab, out: Callable[[], bool]) -> None:
 @pytest.mark.parametrize("before", [True, False], ids=["there", "back"])
 @pytest.mark.parametrize("seconds", [2.65, 4.5, 9.0])
 @pytest.mark.parametrize("path", [FEED_ON, WASTE_ON, FEED_OFF])
-def test_a_slow_command_costs_no_medium_and_blames_neither_tube_nor_bottle(
-    path: str, seconds: float, before: bool
-) -> None:
+def test_a_slow_command_costs_no_medium_and_blames_no_tube_or_bottle(path: str, seconds: float, before: bool) -> None:
     lab = lab_of()
     delayed(lab, seconds, path, before)
     given = lab.truth()["feed_ml"]

@@ -110,9 +110,7 @@ def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an
 
 
 @pytest.mark.parametrize("after_s", [0.3, 0.62, 1.1, 2.2])
-def test_a_feed_pump_switched_on_once_more_in_its_dose_gives_no_more_than_its_window_and_raises_no_level(
-    after_s: float,
-) -> None:
+def test_a_feed_pump_switched_on_once_more_in_its_dose_gives_no_more_than_its_window(after_s: float) -> None:
     """The app shows the same as before, so nothing tells it: declared in docs/faults.md with this bound."""
     lab = lab_of(rate=0.62 / 60.0)
     left = upon(lab, FEED_ON, after_s, f"{FEED_ON}M0")
@@ -126,9 +124,7 @@ def test_a_feed_pump_switched_on_once_more_in_its_dose_gives_no_more_than_its_wi
 
 
 @pytest.mark.parametrize("landing", [(FEED_ON, 0.4), (FEED_ON, 1.0), (FEED_OFF, 0.3), (FEED_OFF, 4.0)])
-def test_a_feed_command_that_is_heard_in_a_later_dose_is_told_with_what_that_may_have_given(
-    landing: tuple[str, float],
-) -> None:
+def test_a_feed_command_heard_in_a_later_dose_is_told_with_what_it_may_have_given(landing: tuple[str, float]) -> None:
     lab = lab_of(rate=0.62 / 60.0)
     kept = [1]
 
@@ -177,9 +173,7 @@ def test_an_old_answer_delivered_again_does_not_become_the_least_that_was_given(
 @pytest.mark.parametrize(
     ("pump", "after_s", "spread"), [("Pump1", 20.0, True), ("Pump3", 20.0, False), ("Pump4", 52.0, True)]
 )
-def test_a_target_that_is_no_number_is_told_and_mended_before_it_costs_a_sample(
-    pump: str, after_s: float, spread: bool
-) -> None:
+def test_a_target_that_is_no_number_is_told_and_mended_in_time(pump: str, after_s: float, spread: bool) -> None:
     """Once it is on record, or in the thermostat's law, the device's thread ends at its next dump, for good."""
     lab = lab_of()
     if pump == "Pump4":

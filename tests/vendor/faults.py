@@ -13,7 +13,7 @@ import json
 import re
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,9 +100,9 @@ class Case:
         path = self.run / "recordings" / f"{m}.csv"
         return max(len(path.read_text().splitlines()) - 1, 0) if path.exists() else 0
 
-    def until_rows(self, more: int, patience: float, which: Sequence[str] | None = None) -> bool:
+    def until_rows(self, more: int, patience: float) -> bool:
         """Wait for so many further rows of every reactor; whether they came."""
-        wanted = {m: self.rows(m) + more for m in which or self.reactors}
+        wanted = {m: self.rows(m) + more for m in self.reactors}
         end = self.bench.now() + patience
         while any(self.rows(m) < n for m, n in wanted.items()):
             if self.bench.now() > end or not self.client.running():
@@ -120,7 +120,13 @@ class Case:
         """The fault begins now."""
         self.fault_s = self.bench.now()
 
-    def without_cable(self, mode: str, minutes: float, unseen: Callable[[Case], None] | None = None) -> None:
+    def befall_in_measuring(self) -> None:
+        """The fault of a healthy run begins in the middle of a measurement of M0."""
+        self.steady()
+        self.bench.until_measuring("M0")
+        self.befall()
+
+    def without_cable(self, mode: str, minutes: float, unseen: Callable[[Case], object] | None = None) -> None:
         """The fault begins now, and is over after so long. Args: unseen: what happens a minute before."""
         self.befall()
         self.cable.set(mode)
@@ -227,7 +233,7 @@ def pulled(mode: str, minutes: float, in_dose: bool = True) -> Callable[[Case], 
 
 
 def pulled_in_step(
-    mode: str, minutes: float, unanswered: bool = False, unseen: Callable[[Case], None] | None = None
+    mode: str, minutes: float, unanswered: bool = False, unseen: Callable[[Case], object] | None = None
 ) -> Callable[[Case], None]:
     """The cable, in a large dose: the second after a step down.
 
@@ -246,18 +252,6 @@ def pulled_in_step(
         case.without_cable(mode, minutes, unseen)
 
     return act
-
-
-def ended_unseen(how: Callable[[Case], None]) -> Callable[[Case], None]:
-    return pulled_in_step("hole", 4.0, unseen=how)
-
-
-def by_hand(case: Case) -> None:
-    case.bench.post("/SetOutputOn/Pump1/0/M1")
-
-
-def wiped(case: Case) -> None:
-    case.bench.kill_worker()
 
 
 def kept_answers(case: Case) -> None:
@@ -357,25 +351,19 @@ def then_resume(case: Case) -> None:
 
 
 def stopped_by_somebody(case: Case) -> None:
-    case.steady()
-    case.bench.until_measuring("M0")
-    case.befall()
+    case.befall_in_measuring()
     case.bench.post("/Experiment/0/M0")
     case.minutes(6.0)
     somebody_starts(case)
 
 
 def worker_killed(case: Case) -> None:
-    case.steady()
-    case.bench.until_measuring("M0")
-    case.befall()
+    case.befall_in_measuring()
     case.bench.kill_worker()
 
 
 def software_killed(case: Case) -> None:
-    case.steady()
-    case.bench.until_measuring("M0")
-    case.befall()
+    case.befall_in_measuring()
     case.kill_software()
     case.minutes(3.0)
     case.restart_software()
@@ -465,11 +453,9 @@ def killed_in_dose(case: Case) -> None:
 
 def signals(case: Case) -> None:
     """13 moments, three signals by turns."""
-    kinds = (SIGNALS * 5)[:13]
-    moments = iter(zip(kinds, range(13), strict=True))
-    for name in ("loading", *AT_START):
-        number, k = next(moments)
-        since = len(case.lines)
+    kinds = iter(SIGNALS * 5)
+    for k, name in enumerate(("loading", *AT_START)):
+        number, since = next(kinds), len(case.lines)
         case.deploy(run=case.folder / f"start{k}")
         if name == "loading":
             time.sleep(0.4)
@@ -478,16 +464,14 @@ def signals(case: Case) -> None:
             case.fail(f"{name}: it never came to that")
         ended_well(case, f"{name}, start, {number.name}", since)
     case.steady()
-    number, k = next(moments)
     case.until_quiet()
-    since = len(case.lines)
+    number, since = next(kinds), len(case.lines)
     case.client.signal(number)
     ended_well(case, f"between doses, {number.name}", since)
     for name, what in IN_A_RUN.items():
-        number, k = next(moments)
         case.resume()
         case.until_rows(2, 600.0)
-        since = len(case.lines)
+        number, since = next(kinds), len(case.lines)
         if not strike(case, what, number):
             case.fail(f"{name}: it never came to that")
         ended_well(case, f"{name}, {number.name}", since)
@@ -563,6 +547,8 @@ LATE = r"POST /SetOutputOn/Pump1/1/"
 ABOUT_M0 = r"/M0(/|$)"
 LINK, REACTOR = "link|answer|slow|cable|agent", "M0"
 NEIGHBOURS = ("M0",)
+WIPED_UNSEEN = pulled_in_step("hole", 4.0, unseen=lambda case: case.bench.kill_worker())
+OFF_UNSEEN = pulled_in_step("hole", 4.0, unseen=lambda case: case.bench.post("/SetOutputOn/Pump1/0/M1"))
 FAULTS = [
     Fault("nothing", 0, nothing, None, (), 20.0),
     # 1: Measuring that is left 1, threads that die there
@@ -600,8 +586,8 @@ FAULTS = [
     Fault("refused 25 min in a large dose", 4, pulled_in_step("refuse", 25.0), LINK, after=25.0),
     Fault("connections refused 6 min in a dose", 4, pulled("refuse", 6.0), LINK, after=16.0),
     Fault("connections reset 6 min in a dose", 4, pulled("reset", 6.0), LINK, after=16.0),
-    Fault("cable out 5 min in a large dose, restarted", 4, ended_unseen(wiped), LINK, after=20.0, between=ALL),
-    Fault("cable out 5 min in a large dose, off by hand", 4, ended_unseen(by_hand), LINK, after=20.0, between=("M1",)),
+    Fault("cable out 5 min in a large dose, restarted", 4, WIPED_UNSEEN, LINK, after=20.0, between=ALL),
+    Fault("cable out 5 min in a large dose, off by hand", 4, OFF_UNSEEN, LINK, after=20.0, between=("M1",)),
     Fault("a proxy repeats an old answer for 90 s", 3, kept_answers, "pump", after=16.0, reactors=("M1",), between=ALL),
     # 5: readings that are refused
     Fault("one of four readings fails", 5, changed(glitch=2), REACTOR, (), ise=True),
