@@ -133,6 +133,10 @@ class DriverLab:
         while self.clock.now() < end and not self.loop.over:
             self.step()
 
+    def notes(self, words: str) -> list[str]:
+        """What the screen said so far and holds these words."""
+        return [note for step in self.steps for note in step.notes if words in note]
+
     def kinds(self) -> set[str]:
         """Every kind of reason that the interlock gave so far."""
         texts = [text for step in self.steps for text in step.reasons if text]

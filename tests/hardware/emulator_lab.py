@@ -20,18 +20,10 @@ STOP_S = 0.09  # and until one that runs stands still
 
 def quiet(mu: float = 0.0, **vial: float) -> DeviceOptions:
     """No noise, known blank, constant pump bias and delay, a culture that grows with mu (1/min)."""
-    fixed = {
-        "blank_low": BLANK,
-        "blank_high": BLANK,
-        "noise_fraction": 0.0,
-        "common_fraction": 0.0,
-        "outlier_rate": 0.0,
-        "stir_noise": 0.0,
-        "on_time_bias_low_s": BIAS_S,
-        "on_time_bias_high_s": BIAS_S,
-        "pump_start_low_s": START_S,
-        "pump_start_high_s": START_S,
-    } | vial
+    fixed = dict.fromkeys(("noise_fraction", "common_fraction", "outlier_rate", "stir_noise"), 0.0)
+    for key, value in (("blank_{}", BLANK), ("on_time_bias_{}_s", BIAS_S), ("pump_start_{}_s", START_S)):
+        fixed |= {key.format("low"): value, key.format("high"): value}
+    fixed |= vial
     plant = PlantConfig(growth=GrowthConfig(mu=mu), pump=PumpConfig(dosing="pulse"))
     return DeviceOptions(vial=VialConfig(**fixed), plant=plant)
 

@@ -20,12 +20,8 @@ Act = tuple[Any, ...]  # error or None, its words, method, arguments
 LOOK, NO_M0 = "GET /getSysdata/", {"M0": 0, "M1": 1}
 HERE, GONE = (LOOK, answer(state("M1"))), (LOOK, answer(state("M1", presentDevices=NO_M0)))
 ABSENT, UNSEEN = (DeviceStateError, "absent"), (DeviceStateError, "not seen present", "post")
-READ, SENT, PAUSE, ALL_OFF = (
-    (None, "", "read"),
-    (None, "", "post", OFF[0]),
-    (None, "", "sleep", 3.0),
-    (None, "", "pumps_off"),
-)
+READ, SENT, PAUSE = (None, "", "read"), (None, "", "post", OFF[0]), (None, "", "sleep", 3.0)
+ALL_OFF = (None, "", "pumps_off")
 
 
 def connection(steps: Steps, log: list[Any] | None = None) -> tuple[Connection, Script]:
@@ -42,14 +38,8 @@ def after_a_refusal(refusal: Reply | Exception) -> tuple[Steps, list[Act]]:
     steps += [(f"POST {OFF[3]}", refusal), (LOOK, refusal), GONE]
     error = (ReactorError, "no answer|status 502", "post")
     posted = [(None, "", "post", path) for path in OFF[1:3]]
-    return steps, [
-        READ,
-        (*error, OFF[0]),
-        *posted,
-        *(2 * [(*error, OFF[3])]),
-        (*ABSENT, "post", OFF[3]),
-        (*UNSEEN, OFF[3]),
-    ]
+    refused = 2 * [(*error, OFF[3])]
+    return steps, [READ, (*error, OFF[0]), *posted, *refused, (*ABSENT, "post", OFF[3]), (*UNSEEN, OFF[3])]
 
 
 def at(sample_s: float, cycles: int, started: str = "2026-01-01 00:00:00") -> Steps:
@@ -84,10 +74,7 @@ CASES: dict[str, tuple[Steps, list[Act]]] = {
         )
         for status, words in ((500, "status 500"), (403, "X-Requested-With"), (200, "expected 204"))
     },
-    "pumps off touches the bus and reads back": (
-        [*read(state()), *posts(*OFF, PROBE), *read(state())],
-        [READ, ALL_OFF],
-    ),
+    "pumps off touches the bus, reads back": ([*read(state()), *posts(*OFF, PROBE), *read(state())], [READ, ALL_OFF]),
     "every pump is tried although one request is lost, but for the waste pump, and then all again": (
         [*read(state()), (f"POST {OFF[0]}", LOST), HERE, *posts(*OFF[1:3], *OFF, PROBE), *read(state())],
         [READ, ALL_OFF],
@@ -153,11 +140,8 @@ def test_a_state_that_is_not_readable_is_no_state() -> None:
 
 def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
     m0, script = connection([])
-    for said, own in (
-        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}),
-        ({"M1": {"Pump1": 3.0}}, {}),
-        ({}, {}),
-    ):
+    other, own_too = {"M1": {"Pump1": 3.0}}, {"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}
+    for said, own in ((own_too, {"Pump2": 8.0}), (other, {}), ({}, {})):
         script.switched_off = lambda said=said: said  # type: ignore[method-assign, misc]
         assert m0.switched_off() == own
 

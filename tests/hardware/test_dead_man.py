@@ -33,13 +33,13 @@ class Wait(threading.Event):
 
 
 class Watched:
-    """An agent and its clock. unverified: of the passes, which one by one cannot be verified; all others are.
+    """An agent and its clock. bad: of the passes, which one by one cannot be verified; all others are.
 
     Attributes: seen, when it made a pass.
     """
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, end_s: float, meanwhile: dict[float, str], unverified: str = ""
+        self, monkeypatch: pytest.MonkeyPatch, end_s: float, meanwhile: dict[float, str], bad: str = ""
     ) -> None:
         clock = SimpleNamespace(monotonic=lambda: 0.0, strftime=lambda form: "")
         monkeypatch.setattr(board_agent, "time", clock)
@@ -49,7 +49,7 @@ class Watched:
 
         def sweep(beats: int) -> list[str]:
             self.seen.append(wait.now)
-            return ["M0: still on: Pump1"] if unverified[len(self.seen) - 1 :][:1] == "x" else []
+            return ["M0: still on: Pump1"] if bad[len(self.seen) - 1 :][:1] == "x" else []
 
         monkeypatch.setattr(self.agent, "sweep", sweep)
 

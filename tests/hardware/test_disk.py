@@ -47,9 +47,7 @@ def _no_descriptor_is_left() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("data", ["µ = 0.04\n", b"\x00\xff", ""])
-def test_an_atomic_file_is_whole_or_unwritten(
-    tmp_path: Path, data: bytes | str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_atomic_file_is_whole_or_none(tmp_path: Path, data: bytes | str, monkeypatch: pytest.MonkeyPatch) -> None:
     path, whole = tmp_path / "s", data.encode() if isinstance(data, str) else data
     path.write_text("old")
     atomic.write(path, data, fsync=False)
@@ -136,10 +134,7 @@ def test_a_recording_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.
 
     real = os.write
     with Recorder(tmp_path / "r", ["time_min", "od"]) as recorder:
-        for write, words in (
-            (lambda fd, data: real(fd, data[:3]), "only 3 of 8 bytes"),
-            (refuse, "row not written: No"),
-        ):
+        for write, words in ((lambda fd, data: real(fd, data[:3]), "only 3 of 8 bytes"), (refuse, "not written: No")):
             with monkeypatch.context() as m:
                 m.setattr(os, "write", write)
                 with pytest.raises(RecordingError, match=words):

@@ -23,8 +23,7 @@ def cycle_start(lab: Lab, cycles: int) -> float:
 def test_start_turns_everything_off_and_the_thermostat_on() -> None:
     lab = Lab()
     for pump in range(1, 5):
-        lab.post(f"/SetOutputTarget/Pump{pump}/M0/-0.1")
-        lab.post(f"/SetOutputOn/Pump{pump}/1/M0")
+        lab.pump(f"Pump{pump}", -0.1)
     lab.post("/SetOutputOn/Stir/1/M0")
     lab.post("/Direction/Pump1/M0")
     before = lab.clock.now()
@@ -124,9 +123,8 @@ def test_records_grow_to_200_then_201_become_109() -> None:
     assert times[-11:] == [60.0 * k for k in range(190, 201)]  # the newest stay as they are
     assert times[0] == 0.0
     assert set(np.diff(times[:90])) <= {60.0, 120.0, 180.0}
-    assert {len(data[k]["record"]) for k in ("OD", "Pump1", "Pump2", "ThermometerIR", "Thermostat", "GrowthRate")} == {
-        109
-    }
+    others = ("OD", "Pump1", "Pump2", "ThermometerIR", "Thermostat", "GrowthRate")
+    assert {len(data[k]["record"]) for k in others} == {109}
     assert len(data["OD"]["targetrecord"]) == len(data["FP1"]["Emit2Record"]) == 109
     assert data["Heat"]["record"] == []
 
@@ -156,8 +154,7 @@ def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
 def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
     lab = running(wait=20.0)
     for pump in (1, 2, 3, 4):
-        lab.post(f"/SetOutputTarget/Pump{pump}/M0/0.3")
-        lab.post(f"/SetOutputOn/Pump{pump}/1/M0")
+        lab.pump(f"Pump{pump}", 0.3)
     lab.post("/Experiment/0/M0")
     state = lab.state()
     assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 1, 1]

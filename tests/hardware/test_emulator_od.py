@@ -113,11 +113,9 @@ def test_noise_of_a_reading_and_of_the_mean() -> None:
 
 
 def test_blanks_are_in_the_range_seen_on_real_devices() -> None:
-    blanks = [
-        Lab(tuple(f"M{k}" for k in range(8)), seed=s, options=quiet(blank_low=11600.0, blank_high=15800.0))
-        for s in range(5)
-    ]
-    counts = [v.spectrometer.blank for lab in blanks for v in lab.device.vials.values()]
+    names, options = tuple(f"M{k}" for k in range(8)), quiet(blank_low=11600.0, blank_high=15800.0)
+    labs = [Lab(names, seed=s, options=options) for s in range(5)]
+    counts = [v.spectrometer.blank for lab in labs for v in lab.device.vials.values()]
     assert min(counts) >= 11600.0
     assert max(counts) <= 15800.0
     assert np.std(counts) > 500.0

@@ -104,10 +104,7 @@ def test_force_is_on_off_and_anything_else_toggles() -> None:
     ("path", "item", "key"),
     [
         ("SetOutputTarget/OD0/M0/{}", "OD0", "target"),
-        *(
-            (f"SetOutputOn/{item}/{{}}/M0", item, "ON")
-            for item in ("Chemostat", "Custom", "Volume", "OD0", "Experiment")
-        ),
+        *((f"SetOutputOn/{m}/{{}}/M0", m, "ON") for m in ("Chemostat", "Custom", "Volume", "OD0", "Experiment")),
     ],
 )
 def test_what_drives_nothing_is_set_and_then_answers_500(path: str, item: str, key: str) -> None:

@@ -24,12 +24,13 @@ from tests.patience import PATIENCE_S
 ROOT = Path(__file__).parents[2]
 
 
-def until(condition: Callable[[], object], timeout: float = PATIENCE_S) -> None:
-    """Wait until `condition()` holds."""
+def until(condition: Callable[[], object], timeout: float = PATIENCE_S) -> bool:
+    """Wait until `condition()` holds, as it must."""
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
+    return True
 
 
 class Served:
@@ -158,13 +159,8 @@ def test_truth_doses_and_list_of_faults(emulator: Served) -> None:
 
 
 def test_garbage_on_the_socket_does_not_end_it(emulator: Served) -> None:
-    for data in (
-        b"",
-        b"\x00\xff\xfe\n\n",
-        b"GET\r\n\r\n",
-        b"POST / HTTP/1.1\r\nContent-Length: x\r\n\r\n",
-        b"A" * 70000,
-    ):
+    wrong = b"POST / HTTP/1.1\r\nContent-Length: x\r\n\r\n"
+    for data in (b"", b"\x00\xff\xfe\n\n", b"GET\r\n\r\n", wrong, b"A" * 70000):
         with socket.create_connection(("127.0.0.1", emulator.port), timeout=2) as connection:
             connection.sendall(data)
     assert emulator.ask("GET", "/getSysdata/")[0] == 200

@@ -41,14 +41,10 @@ def read(feed: bool, waste: bool, start_time: str = START, **changes: Any) -> De
 
 
 def after(
-    known: ReactorHistory,
-    state: DeviceState,
-    now_s: float,
-    seen_s: float = 101.0,
-    stopped: dict[str, float] | None = None,
+    known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float = 101.0, off: dict[str, float] | None = None
 ) -> tuple[Ending, str]:
-    """How the dose ended that is known and was looked at so, its pumps verified off at once."""
-    row = found(known, state, now_s, seen_s, SILENCE_S, stopped)
+    """How the dose ended that is known and was looked at so, its pumps verified off at once; `off` by an agent."""
+    row = found(known, state, now_s, seen_s, SILENCE_S, off)
     return conclude(known.after({"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)
 
 
@@ -72,9 +68,7 @@ def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None
         (119.9, 123.2, 1.2, 1.2),
     ],
 )
-def test_a_dose_cut_short_lies_between_two_volumes(
-    answered_s: float, off_s: float, most_ml: float, least_ml: float
-) -> None:
+def test_a_dose_cut_short_lies_between_two(answered_s: float, off_s: float, most_ml: float, least_ml: float) -> None:
     known = replace(OPEN, feed_on=(100.0, answered_s), feed_off=(off_s, off_s + 0.1), waste_off=(130.0, 130.1))
     ending, words = conclude(known, 131.0, PUMP, PUMP)
     assert (ending.feed_ml, ending.feed_low_ml) == pytest.approx((most_ml, least_ml))
@@ -85,9 +79,7 @@ def test_a_dose_cut_short_lies_between_two_volumes(
     ("on_s", "times", "last_ml"),
     [(62.9, 0, 0.0), (63.5, 1, 0.5), (64.2, 1, 1.2), (125.9, 1, 1.2), (126.3, 2, 0.3), (900.0, 14, 1.2)],
 )
-def test_a_pump_left_on_repeats_every_63_s_and_its_last_dose_may_be_cut(
-    on_s: float, times: int, last_ml: float
-) -> None:
+def test_a_pump_left_on_repeats_every_63_s_its_last_dose_may_be_cut(on_s: float, times: int, last_ml: float) -> None:
     ending, words = after(OPEN, read(True, True), 100.0 + on_s)
     assert (ending.feed_times, ending.waste_times) == (times, int((on_s + 1.0) // 63))
     assert ending.feed_last_ml == pytest.approx(last_ml)

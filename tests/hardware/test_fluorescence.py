@@ -159,9 +159,7 @@ def test_each_reactor_s_own_slot_is_switched() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "toggled", "found"), [("ON", 0, 1, "off"), ("LED", "LEDB", 2, "set to LEDB, CLEAR, nm440, x10")]
 )
-def test_what_somebody_changes_is_put_right_at_once_and_not_shown(
-    key: str, value: Any, toggled: int, found: str
-) -> None:
+def test_what_somebody_changes_is_put_right_and_not_shown(key: str, value: Any, toggled: int, found: str) -> None:
     bench = begun()
     sample(bench)
     before, slot(bench)[key] = toggles(bench), value

@@ -85,9 +85,8 @@ def lab(names: tuple[str, ...], rng: random.Random) -> tuple[VirtualClock, ChiBi
     device = ChiBioDevice(names, clock, np.random.default_rng(0), od=0.5, temperature=37.0, blanked=True)
     wire = Hostile(EmulatorTransport(device), rng)
     rows: Rows = []
-    reactors = ChiBioReactors(
-        wire, clock, ChiBioConfig(reactors=names), log=lambda kind, row: rows.append({"kind": kind, **row})
-    )
+    config = ChiBioConfig(reactors=names)
+    reactors = ChiBioReactors(wire, clock, config, log=lambda kind, row: rows.append({"kind": kind, **row}))
     reactors.begin()
     return clock, device, wire, reactors, rows
 
@@ -132,9 +131,8 @@ def test_no_dose_is_begun_when_the_read_back_is_garbage() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_mutilated_recording_is_read_or_refused_in_one_line(seed: int, tmp_path: Path) -> None:
     rng = random.Random(seed)
-    header = ("time_min,od,pump_rate_ml_s,temperature_degc\n", "exp_time,od_measured,pump_1_rate,media_temp\n", "")[
-        seed % 3
-    ]
+    headers = ("time_min,od,pump_rate_ml_s,temperature_degc\n", "exp_time,od_measured,pump_1_rate,media_temp\n", "")
+    header = headers[seed % 3]
     lines = "".join(f"{k},{0.5 + 0.01 * (k % 7):.4f},{0.01 * (k % 2)},37.0\n" for k in range(60))
     text = (header + (lines if header else lines.replace(",37.0", ""))).encode()
     path = tmp_path / "run.csv"

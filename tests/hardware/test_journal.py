@@ -80,9 +80,7 @@ def test_a_missing_folder_or_file_says_what_to_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["write", "fsync"])
-def test_a_stop_in_a_row_neither_cuts_nor_doubles_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
-) -> None:
+def test_a_stop_in_a_row_cuts_and_doubles_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     """The stop comes when the row is written and not yet counted; the disk takes only a part of the row after it."""
     journal, call, write = Journal(tmp_path / "journal.jsonl"), getattr(os, where), os.write
     journal.append("first", {})

@@ -58,13 +58,7 @@ def test_there_is_none_by_default() -> None:
 
 @pytest.mark.parametrize(
     ("on", "target", "seen"),
-    [
-        (1, 0.5, ""),
-        (0, 0.5, "off"),
-        (1, 0.1, "at a duty of 0.1"),
-        (1, 0.49, "at a duty of 0.49"),
-        (1, math.nan, "at a"),
-    ],
+    [(1, 0.5, ""), (0, 0.5, "off"), *((1, duty, f"at a duty of {duty:g}") for duty in (0.1, 0.49, math.nan))],
 )
 def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
     found = parse_state(json.dumps(state(Pump3__ON=on, Pump3__target=target)).encode())
@@ -301,9 +295,8 @@ def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_stronger(flow_ml_s: 
     pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
-    lab = begun(
-        options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump, minutes=3
-    )
+    options = DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant)
+    lab = begun(options=options, overflow_pump=pump, minutes=3)
     lab.fault("feed_stuck_open")
     lab.run(15)
     assert "falls" in lab.kinds()

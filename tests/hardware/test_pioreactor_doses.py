@@ -396,13 +396,8 @@ def test_pumps_off_while_a_run_goes_on_lets_the_waste_pump_end(lab):
 
 
 def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put_off(lab):
-    for asked, given, kept in (
-        (0.03, 0.0, 0.03),
-        (0.0, 0.0, 0.0),
-        (0.04, 0.07, -0.03),
-        (9.0, 1.5, 0.0),
-        (0.2, 0.2, 0.0),
-    ):
+    of = ((0.03, 0.0, 0.03), (0.0, 0.0, 0.0), (0.04, 0.07, -0.03), (9.0, 1.5, 0.0), (0.2, 0.2, 0.0))
+    for asked, given, kept in of:
         assert lab.dose(asked) == pytest.approx(given)
         assert lab.receipt.kept_ml[0] == pytest.approx(kept)
         assert lab.receipt.waste_ml[0] == pytest.approx(2.0 * given)

@@ -243,10 +243,8 @@ def test_photodiode_and_tube_are_judged_by_channel_and_volume_of_their_own_unit(
     checks = {check.name: check for check in _unit(units.stations[1], units)}
     light, volume = checks["pio02 photodiode"], checks["pio02 volume"]
     assert (light.ok, volume.ok, checks["pio02 wiring"].ok, checks["pio02 pins"].ok) == (*ok, True, False)
-    assert (light.detail, volume.detail) == (
-        f"{channel or '2'} of 1 at 90 degrees",
-        f"{tube} mL in its settings, 14 here",
-    )
+    assert light.detail == f"{channel or '2'} of 1 at 90 degrees"
+    assert volume.detail == f"{tube} mL in its settings, 14 here"
 
 
 def test_a_rig_has_vials_of_the_volume_of_each_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

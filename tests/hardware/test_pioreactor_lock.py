@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,16 +18,9 @@ from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.rig.build import broker
 from hardware.rig.processes import _free_port
 from tests.hardware.pioreactor_lab import UNIT, Lab
-from tests.patience import PATIENCE_S
+from tests.hardware.test_emulator_server import until
 
 HELD = "process 7 on elsewhere controls pio01: one client per unit; remedy"
-
-
-def holds(what: Callable[[], bool]) -> bool:
-    until = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until and not what():
-        time.sleep(0.05)
-    return what()
 
 
 @contextmanager
@@ -42,7 +35,7 @@ def real_broker(folder: Path, settings: str) -> Iterator[int]:
         conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
         with log.open("wb") as out, subprocess.Popen([program, "-c", conf], stdout=out, stderr=out) as process:
             try:
-                assert holds(lambda: process.poll() is not None or b" running" in log.read_bytes())
+                assert until(lambda: process.poll() is not None or b" running" in log.read_bytes())
                 if process.poll() is None:
                     yield number
                     return
@@ -61,7 +54,7 @@ def client(port: int, name: str, *units: str) -> Cluster:
     clock = RealClock()
     config = PioreactorConfig(reactors=units, broker="127.0.0.1", broker_port=port)
     made = Cluster(config, {unit: Mailbox(unit, config, clock) for unit in units}, name, clock)
-    assert holds(lambda: made.connected)
+    assert until(lambda: made.connected)
     return made
 
 
@@ -88,22 +81,22 @@ def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come
     other = client(port, "run2", "pio01", "pio02")
     first = client(port, "run1", "pio01")
     first.hold()
-    assert holds(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
+    assert until(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
     assert other.holder("pio02") == first.holder("pio01") == ""
     first.close()
-    assert holds(lambda: other.holder("pio01") == "")
+    assert until(lambda: other.holder("pio01") == "")
     with killable(port) as pid:
-        assert holds(lambda: f"process {pid} on " in other.holder("pio01"))
+        assert until(lambda: f"process {pid} on " in other.holder("pio01"))
         late = client(port, "run3", "pio01")
-        assert holds(lambda: late.holder("pio01") != "")  # it is retained
+        assert until(lambda: late.holder("pio01") != "")  # it is retained
         late.close()
-    assert holds(lambda: other.holder("pio01") == "")
+    assert until(lambda: other.holder("pio01") == "")
     with killable(port) as pid:
-        assert holds(lambda: f"process {pid} on " in other.holder("pio01"))
+        assert until(lambda: f"process {pid} on " in other.holder("pio01"))
         os.kill(pid, signal.SIGSTOP)  # gone, and the broker still believes in it
         again = client(port, "run1", "pio01")
         again.hold()
-        assert holds(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
+        assert until(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
         assert again.holder("pio01") == ""
         again.close()
     other.close()
@@ -113,11 +106,11 @@ def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come
 def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
     other, first = client(port, "run2", "pio01"), client(port, "run1", "pio01")
     first.hold()
-    assert holds(lambda: other.holder("pio01") != "")
+    assert until(lambda: other.holder("pio01") != "")
     first._client.socket().shutdown(2)  # the broker sends the last will
-    assert holds(lambda: first.broke_s > 0.0 and first.connected)
+    assert until(lambda: first.broke_s > 0.0 and first.connected)
     assert "closed" in first.lost
-    assert holds(lambda: other.holder("pio01") != "")
+    assert until(lambda: other.holder("pio01") != "")
     first.close()
     other.close()
 

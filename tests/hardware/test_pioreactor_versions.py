@@ -7,8 +7,7 @@ import json
 import os
 import signal
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -26,19 +25,13 @@ from hardware.rig.files import flows
 from hardware.rig.processes import _as_on_a_unit
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
 from tests.hardware.pioreactor_bench import PACKAGES, UNIT, need_the_rig, started
+from tests.hardware.test_emulator_server import until
 from tests.patience import PATIENCE_S
 
 pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(2.0 * PATIENCE_S)]  # one rig at a time
 rig = pytest.mark.slow
 
 ENDLESS_S = 4.0 * PATIENCE_S  # a run of a pump that does not end by itself while a test waits
-
-
-def until(holds: Callable[[], bool]) -> bool:
-    end = time.monotonic() + PATIENCE_S
-    while not (held := holds()) and time.monotonic() < end:
-        time.sleep(0.05)
-    return held
 
 
 class Asked:

@@ -38,10 +38,8 @@ def test_no_blank_is_taken_while_something_is_wrong() -> None:
 class Told:
     """Two reactors whose counts and temperatures are told minute by minute; `blanks` are those that were set."""
 
-    def __init__(
-        self, counts: list[tuple[float, float]], degc: list[tuple[float, float]], target: float = 33.0
-    ) -> None:
-        self.names, self.config = ("M0", "M6"), SimpleNamespace(temperature=target)
+    def __init__(self, counts: list[tuple[float, float]], degc: list[tuple[float, float]]) -> None:
+        self.names, self.config = ("M0", "M6"), SimpleNamespace(temperature=33.0)
         self.counts, self.degc, self.minute, self.blanks = counts, degc, 0, dict[str, float]()
         self.stations = [
             SimpleNamespace(set_blank=lambda v, name=name: self.blanks.update({name: v})) for name in self.names

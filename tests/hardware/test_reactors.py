@@ -158,9 +158,7 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
 
 @pytest.mark.parametrize("named", [0, 1])
 @pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True), (0.0, True)])
-def test_a_stopped_experiment_is_started_at_once_if_it_is_said_to_be_over(
-    named: int, rest_s: float, waits: bool
-) -> None:
+def test_a_stopped_experiment_is_started_at_once_if_it_has_ended(named: int, rest_s: float, waits: bool) -> None:
     """Newer apps name the reactor in the line that says so. Before that its last cycle would end the new one's heat."""
     lab = DriverLab()
     lab.fault("terminal_named", named)
@@ -484,7 +482,6 @@ def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: i
     given = [r for r in lab.of("intent") if r["feed_ml"] > 0]
     assert len(given) - 2 <= runs  # the kill may have cut one off before it began, and so did the stop at the end
     assert runs <= len(acted) + repeats
-    assert (
-        lab.truth()["feed_ml"] <= lab.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
-    )
+    intended_ml = sum(r["feed_ml"] for r in rows if r["kind"] == "intent")
+    assert lab.truth()["feed_ml"] <= lab.fed[0] + intended_ml + 1.5 * repeats
     assert lab.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)

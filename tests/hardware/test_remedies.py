@@ -13,6 +13,7 @@ from hardware.errors import LinkError
 from hardware.link.http import HttpTransport
 from hardware.link.transport import TransportConfig
 from tests.hardware.script import state
+from tests.hardware.test_diagnosis import EXPECTED
 from tests.hardware.test_http_transport import Server
 from tests.patience import PATIENCE_S
 
@@ -24,18 +25,8 @@ def test_a_thread_that_no_number_ended_is_not_said_to_be_mended_by_a_restart_of_
     for changed, spoilt in ((changes, ("Pump3",)), ({}, ())):
         seen = parse_state(json.dumps(state(**changed)).encode())
         assert seen.spoilt == spoilt
-        fault = diagnose(
-            seen,
-            ChiBioConfig(),
-            age_s=150.0,
-            start_time=seen.start_time,
-            blank=seen.blank,
-            setpoint=math.nan,
-            dosing=False,
-            stuck="",
-            ended="",
-            overflow_trouble="",
-        )
+        expected = {**EXPECTED, "start_time": seen.start_time, "blank": seen.blank}
+        fault = diagnose(seen, ChiBioConfig(), age_s=150.0, **expected)
         assert fault is not None
         assert fault.kind == "stalled"
         assert ("software" in fault.remedy) == bool(spoilt)

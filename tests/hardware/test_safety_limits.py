@@ -655,6 +655,7 @@ def test_a_reason_speaks_of_the_numbers_of_its_own_reactor() -> None:
         "impossible: OD 4.200, raw 7000: outside what can be",
         "spectrometer: OD 0.81, raw 2: the light sensor failed",
     ]
+    assert interlock.state()["_latched"] == [Response.REGULATE, 0.0, 0.0, 0.0]
 
 
 def test_what_was_fed_at_least_is_booked_beside_what_was_fed_at_most() -> None:

@@ -75,9 +75,8 @@ def test_a_slow_command_costs_no_medium_and_blames_no_tube_or_bottle(path: str, 
     check_booked(lab)
     assert lab.truth()["feed_ml"] - given > 10.5 * 0.6
     assert not FALSE_ALARMS & lab.kinds()
-    notes = [note for step in lab.steps for note in step.notes]
     slow = "M0: the link is slow: the feed pump's command was answered after "
-    assert any(note.startswith(slow) for note in notes) == (path == FEED_ON)
+    assert any(note.startswith(slow) for note in lab.notes(slow)) == (path == FEED_ON)
 
 
 @pytest.mark.parametrize(
@@ -139,9 +138,8 @@ def test_a_feed_command_without_an_answer_is_looked_for_and_booked_as_found(lost
     lab.run(6)
     check_booked(lab)
     assert not FALSE_ALARMS & lab.kinds()
-    notes = [note for step in lab.steps for note in step.notes]
-    assert any("what it did is looked for" in note for note in notes)
-    assert any("gave no medium" in note for note in notes) == (lost == "there")
+    assert lab.notes("what it did is looked for")
+    assert bool(lab.notes("gave no medium")) == (lost == "there")
 
 
 @pytest.mark.parametrize("late_s", [24.0, 40.0, 500.0])
@@ -174,8 +172,7 @@ def test_a_feed_command_that_is_heard_after_it_was_given_up_is_booked_and_the_li
     assert lab.truth()["feed_ml"] > given + 2.0
     check_booked(lab)
     assert not FALSE_ALARMS & lab.kinds()
-    said = [note for step in lab.steps for note in step.notes]
-    assert any(AGAIN in note for note in said)
+    assert lab.notes(AGAIN)
 
 
 @pytest.mark.parametrize(("seconds", "fails"), [(15.0, False), (20.0, True)], ids=["slow", "silent"])
@@ -195,4 +192,4 @@ def test_one_reactor_that_is_slow_or_silent_does_not_take_its_neighbours_time(se
     minutes = (lab.clock.now() - began) / 60.0
     more = [lab.truth(name)["feed_ml"] - before for name, before in zip(("M1", "M2"), given, strict=True)]
     assert min(more) > 0.6 * 0.72 * minutes  # 0.72 mL a minute are asked for; two minutes go by until it is found out
-    assert "link" in lab.kinds() if fails else any("too slowly" in note for step in lab.steps for note in step.notes)
+    assert "link" in lab.kinds() if fails else lab.notes("too slowly")

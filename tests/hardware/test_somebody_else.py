@@ -13,10 +13,6 @@ from tests.hardware.driver_lab import DriverLab
 from tests.hardware.test_slow_commands import FALSE_ALARMS, FEED_OFF, FEED_ON, WASTE_ON, check_booked, lab_of
 
 
-def notes(lab: DriverLab, words: str) -> list[str]:
-    return [note for step in lab.steps for note in step.notes if words in note]
-
-
 def check_held(lab: DriverLab) -> None:
     """The truth lies between what is told at least and what is booked, but for what a motor gives by itself."""
     lab.run(2)
@@ -66,7 +62,7 @@ def test_a_dose_from_the_web_page_is_booked_drained_and_told_once(after_s: float
         lab.run(3)
         assert lab.truth()["feed_ml"] > given + 4.0
     assert lab.truth()["volume_ml"] < 21.0
-    assert len(notes(lab, "without a dose, booked as the latter: its target was changed from")) == times
+    assert len(lab.notes("without a dose, booked as the latter: its target was changed from")) == times
     if after_s < 50.0:  # else it is cut, and nobody knows when
         check_booked(lab)
     check_held(lab)
@@ -81,7 +77,7 @@ def test_a_dose_from_the_web_page_that_nobody_saw_is_told_by_the_target_that_it_
     lab.step()
     send(lab, 22.0, *page, pause_s=1.5)
     lab.run(3)
-    assert len(notes(lab, "Pump1 gave 0.00 to 2.62 mL without a dose")) == 1
+    assert len(lab.notes("Pump1 gave 0.00 to 2.62 mL without a dose")) == 1
     check_held(lab)
 
 
@@ -104,7 +100,7 @@ def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an
     lab = lab_of(rate=1.04 / 60.0)
     upon(lab, when, after_s, path)
     lab.run(4)
-    assert bool(notes(lab, "gave 0.00 to") or notes(lab, "gave 1.04 to") or notes(lab, "was repeated")) == told
+    assert bool(lab.notes("gave 0.00 to") or lab.notes("gave 1.04 to") or lab.notes("was repeated")) == told
     check_held(lab)
     assert not FALSE_ALARMS & lab.kinds()
 
@@ -141,8 +137,8 @@ def test_a_feed_command_heard_in_a_later_dose_is_told_with_what_it_may_have_give
     lab.on_post(post)
     lab.run(5)
     assert kept[-1] == 3
-    told = notes(lab, "0.62 to 1.24 mL, booked as the former: a feed command that was given up")
-    assert told or notes(lab, AGAIN)
+    told = lab.notes("0.62 to 1.24 mL, booked as the former: a feed command that was given up")
+    assert told or lab.notes(AGAIN)
     lab.run(2)
     lab.clock.sleep(15.0)
     booked_ml = float(lab.loop.interlock.budget.fed_ml[0])
@@ -181,8 +177,8 @@ def test_a_target_that_is_no_number_is_told_and_mended_in_time(pump: str, after_
     lab.step()
     send(lab, after_s, f"/SetOutputTarget/{pump}/M0/nan")
     lab.run(3)
-    assert len(notes(lab, f"{pump} was set to no number by somebody and was set to 0")) == 1
-    assert len(notes(lab, "restart the device's software")) == spread
+    assert len(lab.notes(f"{pump} was set to no number by somebody and was set to 0")) == 1
+    assert len(lab.notes("restart the device's software")) == spread
     assert lab.device.apps["M0"].data[pump]["target"] == (0.0 if pump != "Pump1" else pytest.approx(0.0086, abs=1e-3))
     assert lab.of("fault") == []
     check_held(lab)

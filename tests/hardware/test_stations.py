@@ -225,12 +225,7 @@ def test_what_a_logbook_tells_shows_and_reports(caplog: pytest.LogCaptureFixture
 
 
 def opening(
-    folder: Path,
-    backend: Any,
-    bench: Bench | None = None,
-    ago_s: float = 0.0,
-    resumed: bool = True,
-    plant: PlantConfig | None = None,
+    folder: Path, backend: Any, bench: Bench | None = None, ago_s: float = 0.0, resumed: bool = True, plant: Any = None
 ) -> Opening:
     """Of a run that began so long ago, or of a new one."""
     path = folder / "journal.jsonl"
@@ -284,9 +279,8 @@ def test_a_run_of_a_fast_device_goes_on_where_it_is_by_the_device_s_time(
         with module.FAMILY.open(opening(folder, backend, ago_s=ago_s, resumed=bool(ago_s))) as reactors:
             ((histories, elapsed_s),) = reactors.began  # type: ignore[attr-defined]
         assert elapsed_s == pytest.approx(4.0 * ago_s, abs=20.0)
-        assert {name: history.temperature for name, history in histories.items()} == (
-            {backend.reactors[-1]: 31.5} if ago_s else {}
-        )
+        known = {name: history.temperature for name, history in histories.items()}
+        assert known == ({backend.reactors[-1]: 31.5} if ago_s else {})
     assert len(checked) == (0 if ago_s else 2)
 
 
@@ -343,9 +337,8 @@ def test_an_emulated_device_is_started_with_all_that_is_said_of_it() -> None:
 
 def test_simulated_vials_are_dosed_row_by_row_by_what_their_pump_is_believed_to_give() -> None:
     """Every 2 min; 0.8 mL/s believed, 1 mL/s true: 0.6 mL are asked for, 0.75 mL flow into 20 mL."""
-    plant = Plant(
-        PlantConfig(pump=PumpConfig(dosing="pulse"), growth=GrowthConfig(mu=0.0)), 3, np.random.default_rng(0)
-    )
+    config = PlantConfig(pump=PumpConfig(dosing="pulse"), growth=GrowthConfig(mu=0.0))
+    plant = Plant(config, 3, np.random.default_rng(0))
     reactors = SimulatedReactors(plant, SimulatedConfig(reactors=("a", "b", "c"), pump_ml_s=0.8), control_min=2.0)
     assert reactors.measure().time_s.tolist() == [0.0] * 3
     rows, target = np.array([True, False, True]), np.array([NAN, 40.0, 38.0])

@@ -45,7 +45,7 @@ def test_a_dead_thread_costs_one_restart_neither_heat_nor_stirring_and_the_neigh
     data = lab.device.apps["M0"].data
     assert [data[item]["ON"] for item in ("Thermostat", "Stir", "Experiment")] == [1, 1, 1]
     assert lab.truth("M0")["temperature"] > 36.0
-    assert any("restarted after: stalled" in note for step in lab.steps for note in step.notes)
+    assert lab.notes("restarted after: stalled")
 
 
 def test_a_running_experiment_that_measures_for_ever_is_started_anew(caplog: pytest.LogCaptureFixture) -> None:
@@ -67,8 +67,7 @@ def test_a_restart_that_brings_no_sample_is_said_and_tried_again() -> None:
     lab = begun(options=quiet(mu=0.025), minutes=3)
     lab.fault("internal_zero", 2)
     lab.run(20)
-    notes = [note for step in lab.steps for note in step.notes]
-    assert any("the restart before brought no sample, attempt 2 follows" in note for note in notes)
+    assert lab.notes("the restart before brought no sample, attempt 2 follows")
     assert lab.steps[-1].reasons[0] is None
     assert lab.samples[0] >= 8
 
@@ -83,7 +82,7 @@ def test_a_start_that_the_device_does_not_take_is_said_and_tried_again(monkeypat
 
     monkeypatch.setattr(lab.wire.inner, "post", post)
     lab.run(15)
-    said = [note for step in lab.steps for note in step.notes if "could not be restarted after" in note]
+    said = lab.notes("could not be restarted after")
     assert "the experiment does not start; look at the device's terminal" in said[0]
     assert lab.samples[1] > lab.samples[0] + 8
     deaf["on"] = False

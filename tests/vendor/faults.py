@@ -72,9 +72,10 @@ class Case:
             way.append(f"backend.transport.token_file={self.agent.token}")
         way += [f"backend.speed={SPEED:g}", f"backend.reactors=[{','.join(self.reactors)}]"]
         arguments = [f"experiments.{name}", *way, f"backend.calibration={self.calibration}", *more]
-        self.clients.append(
-            Client(self.bench, self.folder / "console.txt", *arguments, f"hydra.run.dir={run or self.run}")
-        )
+        return self.start(*arguments, f"hydra.run.dir={run or self.run}")
+
+    def start(self, *arguments: str) -> Client:
+        self.clients.append(Client(self.bench, self.folder / "console.txt", *arguments))
         return self.client
 
     def deploy(self, run: Path | None = None) -> Client:
@@ -83,9 +84,7 @@ class Case:
         return self.command("deploy", "backend=chibio", *schedule, run=run)
 
     def resume(self) -> Client:
-        arguments = ["experiments.deploy", f"resume={self.run}"]
-        self.clients.append(Client(self.bench, self.folder / "console.txt", *arguments))
-        return self.client
+        return self.start("experiments.deploy", f"resume={self.run}")
 
     def sleep(self, seconds: float) -> None:
         self.bench.sleep(seconds)
@@ -433,9 +432,8 @@ def ended_well(case: Case, moment: str, since: int) -> None:
         if run.start_s + run.seconds > after
     ]
     words = [line for line in said if re.search("verified|not verified|could not|switch the pump", line, re.IGNORECASE)]
-    case.facts[moment] = (
-        f"exit {status}; {(words or said or ['nothing said'])[-1][-110:]}; motors after: {on or 'none'}"
-    )
+    newest = (words or said or ["nothing said"])[-1]
+    case.facts[moment] = f"exit {status}; {newest[-110:]}; motors after: {on or 'none'}"
     warned = any(re.search("not verified|could not|cannot|by hand", line, re.IGNORECASE) for line in said)
     if on and not warned:
         case.fail(f"{moment}: {len(on)} runs of motors after the end, and no word of it: {said[-1:]}")
