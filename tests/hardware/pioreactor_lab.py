@@ -347,12 +347,11 @@ class World(VirtualClock):
         self.broker = False
         self.mqtt.broke_s = self.now()
         self.retained.clear()
-        for job, me in list(self.run_now.items()):
+        for job in list(self.run_now):
             del self.run_now[job]
             self.locks.discard(PINS[job])
             self.pin(job, False)
             self._unlist(job)
-            del me
         self.later(back_s, self._broker_back)
 
     def freeze_broker(self, for_s: float) -> None:

@@ -75,9 +75,7 @@ def test_it_trips_after_two_minutes_without_a_request_and_once_for_each_silence(
     assert watched.agent.trips == len(trips)
 
 
-def test_what_is_not_verified_off_is_tried_after_2_s_and_ever_later_up_to_a_minute_in_each_silence_anew(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_not_verified_off_is_tried_ever_later_up_to_a_minute_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pump that runs on empties a bottle in minutes: the first tries follow at once, and it is never given up."""
     watched = Watched(monkeypatch, 900.0, {700.0: "request"}, "xxxxxxxxx.xx.")
     watched.agent._watch()

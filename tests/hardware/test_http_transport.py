@@ -261,9 +261,7 @@ def test_an_emulator_that_cannot_start_says_why() -> None:
 @pytest.mark.parametrize(
     ("code", "step", "least"), [("site-packages/http", 29, 1000), ("hardware/link/http.py", 1, 30)]
 )
-def test_ctrl_c_at_any_line_of_a_request_leaves_no_lock_and_no_connection_taken(
-    code: str, step: int, least: int, server: Server
-) -> None:
+def test_ctrl_c_at_any_line_of_a_request_leaves_nothing_taken(code: str, step: int, least: int, server: Server) -> None:
     """Each line of a request is a place at which a signal can come: of the library every 29th is tried, all of ours.
 
     And another signal behind it is heard, whichever handler was being put back then.

@@ -23,10 +23,6 @@ def doses(lab: DriverLab, name: str = "M0", pump: str = "Pump1") -> list[tuple[f
     return [(d.start_s, d.seconds) for d in lab.device.vials[name].doses if d.pump == pump]
 
 
-def fixed(lab: DriverLab, rate: float) -> None:
-    lab.law.rate = rate
-
-
 # -- a healthy run ---------------------------------------------------------------------------------------------------
 
 
@@ -87,7 +83,7 @@ def test_motors_run_their_whole_dose_and_the_waste_before_fluid_comes_and_until_
 
 def test_doses_of_several_reactors_overlap() -> None:
     lab = DriverLab(("M0", "M1", "M2", "M3"))
-    fixed(lab, 0.02)
+    lab.law.rate = 0.02
     for name in lab.names:  # all in one phase: four waste doses of 9 to 16 s do not fit one after another
         lab.device.handle("POST", f"/Experiment/1/{name}")
     lab.reactors.begin()
@@ -204,7 +200,7 @@ def test_no_failed_request_doubles_a_dose_or_leaves_a_pump_on(fault: str, reques
     """Whichever request of a dose, from its targets to its verification, goes wrong."""
     lab = begun(options=quiet(mu=0.025), rate=0.0, minutes=3)
     assert not doses(lab)
-    fixed(lab, 0.02)
+    lab.law.rate = 0.02
     asked = 0
     inner = lab.wire.inner
     real = inner._request

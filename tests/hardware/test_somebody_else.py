@@ -94,7 +94,7 @@ def test_a_dose_from_the_web_page_that_nobody_saw_is_told_by_the_target_that_it_
         (FEED_ON, 0.5, "/SetOutputTarget/Pump2/M0/0.5", False),  # more of the waste harms nothing
     ],
 )
-def test_what_somebody_changes_inside_a_dose_is_seen_and_its_volume_told_with_an_interval(
+def test_what_somebody_changes_in_a_dose_is_told_as_an_interval(
     when: str, after_s: float, path: str, told: bool
 ) -> None:
     lab = lab_of(rate=1.04 / 60.0)

@@ -257,9 +257,7 @@ class Begun:
 
 
 @pytest.mark.parametrize("ago_s", [0.0, 100.0])
-def test_a_run_of_a_fast_device_goes_on_where_it_is_by_the_device_s_time(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ago_s: float
-) -> None:
+def test_a_fast_device_s_run_goes_on_by_its_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ago_s: float) -> None:
     """A hundred seconds ago at four times real time: 400 s into the run; what is new is checked first."""
 
     @contextmanager
