@@ -55,41 +55,6 @@ def _train(trainer: Trainer) -> Trainer:
     return trainer
 
 
-def test_one_update_agrees_with_torch() -> None:
-    """Minibatch, target, squared error and Adam's step, recomputed with autograd from the same draws."""
-    config = DQNConfig(**{**SMALL.__dict__, "learn_start": 40, "total_steps": 41, "gamma": 0.9})
-    trainer = _trainer(config, range(2))
-    before = trainer.agent.network.flat.clone()
-    _train(trainer)
-    agent = trainer.agent
-    assert agent.updates == 1
-    for i in range(2):
-        parameters = before[i].double().clone().requires_grad_()
-
-        def q(observation: torch.Tensor, flat: torch.Tensor = parameters) -> torch.Tensor:
-            h, start = observation.double(), 0
-            for k, (inputs, outputs) in enumerate(((3, 16), (16, 16), (16, 3))):
-                weight = flat[start : start + inputs * outputs]
-                weight = weight.view(outputs, inputs).T if k == 2 else weight.view(inputs, outputs)
-                start += inputs * outputs
-                h = h @ weight + flat[start : start + outputs]
-                start += outputs
-                h = torch.relu(h) if k < 2 else h
-            return h
-
-        draws = np.random.default_rng(streams(range(i, i + 1))["replay"][0]).random(config.batch_size)
-        rows = agent.replay.state_dict()["rows"][i][(draws * 41).astype(int)]
-        s_tm1, s_t, action, reward = rows[:, :3], rows[:, 3:6], rows[:, 6].long(), rows[:, 7].double()
-        with torch.no_grad():
-            # before the first copy the target network holds the initial weights of the online one
-            target = reward + 0.9 * q(s_t).amax(1)
-        (0.5 * (q(s_tm1).gather(1, action[:, None])[:, 0] - target) ** 2).mean().backward()
-        slope = parameters.grad
-        assert slope is not None
-        expected = before[i] - config.learning_rate * slope / (slope.abs() + 1e-8)  # Adam's first step
-        torch.testing.assert_close(agent.network.flat[i].double(), expected, rtol=1e-4, atol=1e-6)
-
-
 def _filled(config: DQNConfig, seeds: range) -> DQNAgent:
     """An agent with 40 transitions in its memory and no update yet."""
     agent, rng = DQNAgent(config, 3, 3, streams(seeds), Shifted()), np.random.default_rng(0)

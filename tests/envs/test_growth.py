@@ -38,20 +38,6 @@ def test_chemostat_reaches_its_steady_state():
     np.testing.assert_allclose(state[:, 0], yield_od * (1.0 - substrate), rtol=1e-6)
 
 
-def test_batch_growth_follows_the_logistic_curve_when_substrate_is_everything():
-    """With k_s much larger than s the rate is linear in s, and without flow x + Y s is conserved: logistic growth."""
-    k_s, yield_od, x0 = 1e6, 2.0, 0.05
-    rate = 0.03  # of mu_max / k_s
-    culture = DilutedCulture(Monod(rate * k_s, k_s), 1.0, yield_od)
-    capacity = x0 + yield_od
-    growth = rate * capacity / yield_od
-    state = np.array([[x0, 1.0]])
-    state = rk4(lambda y: culture.derivative(y, np.zeros(1)), state, 100.0, 1000)
-    expected = capacity / (1.0 + (capacity / x0 - 1.0) * np.exp(-growth * 100.0))
-    assert state[0, 0] == pytest.approx(expected, rel=1e-5)
-    assert state[0, 0] + yield_od * state[0, 1] == pytest.approx(capacity, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("response", "low", "high"),
     [(Arrhenius(56.0), 0.59, 0.62), (Cardinal(), 0.64, 0.67)],
@@ -63,12 +49,8 @@ def test_thirty_degrees_against_thirty_seven(response, low, high):
     assert low <= rate[0] / rate[1] <= high
 
 
-def test_no_growth_outside_the_cardinal_temperatures():
-    assert np.all(Cardinal()(np.array([0.0, 4.0, 50.0, 80.0])) == 0.0)
-
-
-def test_cardinal_model_peaks_at_its_optimum():
+def test_cardinal_model_peaks_at_its_optimum_and_is_zero_outside_its_limits():
     model = Cardinal()
     t = np.linspace(7.0, 47.0, 4001)
     assert t[np.argmax(model(t))] == pytest.approx(model.t_opt, abs=0.02)
-    assert model(np.array([model.t_opt]))[0] == pytest.approx(1.0)
+    assert model(np.array([0.0, 4.0, model.t_opt, 50.0])).tolist() == pytest.approx([0.0, 0.0, 1.0, 0.0], abs=0.0)

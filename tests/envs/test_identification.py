@@ -131,33 +131,21 @@ def coverage(config: OpenLoop, n: int, seed: int) -> tuple[float, float]:
     return float(mu), float(tau)
 
 
-def test_intervals_hold_the_truth_at_one_percent_noise() -> None:
-    for share in coverage(OpenLoop(), 200, seed=20):
-        assert 0.90 <= share <= 0.99
-
-
-def test_intervals_allow_for_correlated_noise() -> None:
+@pytest.mark.parametrize(("correlation", "n", "least"), [(0.0, 200, 0.90), (0.8, 150, 0.87)])
+def test_intervals_hold_the_truth_also_under_correlated_noise(correlation: float, n: int, least: float) -> None:
     """Ignoring the correlation of 0.8 would cover some 43 %."""
-    for share in coverage(OpenLoop(noise_correlation=0.8), 150, seed=21):
-        assert 0.87 <= share <= 0.99
+    for share in coverage(OpenLoop(noise_correlation=correlation), n, seed=20 + (n == 150)):
+        assert least <= share <= 0.99
 
 
 # ---------------------------------------------------------------- identifiability
 
 
-@pytest.mark.parametrize(
-    ("rate", "message"),
-    [
-        (lambda t: 0.0 * t, "pump never runs"),
-        (lambda t: 0.0 * t + 0.01, "pump never stops"),
-        (lambda t: np.where((t > 50) & (t < 52), 0.02, 0.0), "pump runs in 1 rows"),
-    ],
-)
-def test_recording_that_cannot_give_tau_says_so(rate: object, message: str) -> None:
+def test_recording_of_one_dose_says_that_it_cannot_give_tau() -> None:
     time = np.arange(200.0)
-    pump_rate = rate(time)  # type: ignore[operator]
+    pump_rate = np.where((time > 50) & (time < 52), 0.02, 0.0)
     od = trajectory(time, pump_rate, 0.012, 1 / 3, 0.05) * (1 + 0.01 * np.random.default_rng(0).standard_normal(200))
-    with pytest.raises(NotIdentifiable, match=message):
+    with pytest.raises(NotIdentifiable, match="pump runs in 1 rows"):
         calibrate(series(time, od, pump_rate))
 
 
@@ -200,9 +188,7 @@ WILD = np.random.default_rng(4).uniform(0.0, 3.0, 121)
 @pytest.mark.parametrize(
     ("rows", "fault", "reason", "lost"),
     [
-        ([20, 97, 98, 180, 300], [1.5, 0.6, 0.7, 2.0, 1.3], "outlier", [20, 97, 98, 180, 300]),
         (slice(150, 158), lambda y: y + 0.6, "burst", range(150, 158)),
-        (slice(200, None), lambda y: y[0], "sensor frozen", range(201, 361)),
         (slice(250, None), 6.0, "sensor broken or moved from there on", range(249, 361)),
         (slice(250, None), 0.2, "another regime from there on", range(249, 361)),
         (slice(240, None), lambda y: WILD, "sensor noisy", None),
@@ -220,14 +206,7 @@ def test_a_fault_of_the_sensor_is_found_where_it_was_put(rows, fault, reason, lo
     kept = np.flatnonzero(np.isfinite(screened.series.od))
     assert len(kept) == 361 - sum(map(len, found.values()))
     assert reason != "sensor noisy" or kept[-1] < 250
-    assert reason not in ("burst", "outlier") or screened.stretches == ((0, 361),)
-
-
-@pytest.mark.parametrize("level", [0.0, 0.4])
-def test_dead_sensor_is_refused(level: float) -> None:
-    s = simulated()
-    with pytest.raises(ValueError, match="trustworthy readings above zero are left"):
-        calibrate(series(s.time, np.full(361, level), s.pump_rate))
+    assert reason != "burst" or screened.stretches == ((0, 361),)
 
 
 @pytest.mark.slow

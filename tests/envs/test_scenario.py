@@ -10,22 +10,13 @@ from envs.until import Conditions
 STEPS = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
 
 
-def test_phases_change_at_their_edges():
-    minute = np.array([np.nan, -1.0, 0.0, 29.99, 30.0, 59.0, 60.0, 90.0, 500.0])
-    np.testing.assert_array_equal(STEPS.phase(minute), [-1, -1, 0, 0, 1, 1, 2, 2, 2])
-    setpoint, temperature = STEPS.at(minute)
-    np.testing.assert_array_equal(setpoint, [0.8, 0.8, 0.8, 0.8, 0.65, 0.65, 0.5, 0.5, 0.5])
-    assert temperature[-1] == 30.0
-    assert STEPS.total_min == 90.0
-
-
 def test_phases_of_unequal_length_end_where_their_own_minutes_do():
     long = Scenario((0.3, 0.6, 0.9), (10.0, 25.0, 5.0), (30.0, 37.0, 33.0), outputs=("pump4 1 mL", None, None))
-    minute = np.array([-5.0, 9.99, 10.0, 34.99, 35.0, 39.0, 41.0])
-    assert long.phase(minute).tolist() == [-1, 0, 1, 1, 2, 2, 2]
+    minute = np.array([np.nan, -5.0, 0.0, 9.99, 10.0, 34.99, 35.0, 41.0, 500.0])
+    assert long.phase(minute).tolist() == [-1, -1, 0, 0, 1, 1, 2, 2, 2]
     setpoint, temperature = long.at(minute)
-    assert setpoint.tolist() == [0.3, 0.3, 0.6, 0.6, 0.9, 0.9, 0.9]
-    assert temperature.tolist() == [30.0, 30.0, 37.0, 37.0, 33.0, 33.0, 33.0]
+    assert setpoint.tolist() == [0.3, 0.3, 0.3, 0.3, 0.6, 0.6, 0.9, 0.9, 0.9]
+    assert temperature.tolist() == [30.0, 30.0, 30.0, 30.0, 37.0, 37.0, 33.0, 33.0, 33.0]
     assert (long.edges.tolist(), long.total_min, long.supplied) == ([0.0, 10.0, 35.0, 40.0], 40.0, {4})
 
 

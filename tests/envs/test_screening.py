@@ -75,10 +75,10 @@ def test_a_pause_is_five_minutes_and_five_times_the_spacing(pause: float, every:
     assert GAP_MIN == 5.0
 
 
-@pytest.mark.parametrize(("left", "enough"), [(9, False), (10, True)])
-def test_ten_readings_above_zero_are_needed(left: int, enough: bool) -> None:
+@pytest.mark.parametrize(("left", "empty", "enough"), [(9, np.nan, False), (9, 0.0, False), (10, np.nan, True)])
+def test_ten_readings_above_zero_are_needed(left: int, empty: float, enough: bool) -> None:
     s = resting(0.002, 40)
-    od = np.where(np.arange(40) < left, s.od, np.nan)
+    od = np.where(np.arange(40) < left, s.od, empty)
     if enough:
         assert changed(s, od).stretches == ((0, 10),)
     else:

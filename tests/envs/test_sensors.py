@@ -34,10 +34,6 @@ def test_counts_invert_the_devices_formula() -> None:
     np.testing.assert_allclose(added, [1.2, 3.1, 4.9, 6.2], atol=0.06)
 
 
-def test_a_perfect_sensor_adds_nothing() -> None:
-    np.testing.assert_array_equal(readings(SensorConfig(), 0.5, 3, 10), 0.5)
-
-
 @pytest.mark.parametrize("od", [0.2, 0.5, 1.0])
 def test_noise_has_the_configured_size_and_memory(od: float) -> None:
     r = readings(SensorConfig(noise_floor=0.0033, noise_relative=0.003, lag1=0.12), od)[5:]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.bench import Bench
-from envs.task import EnvConfig, pump_rates, step_factors, tracking_reward
+from envs.task import EnvConfig, pump_rates, step_factors
 
 
 def test_action_grid_is_the_papers():
@@ -15,23 +15,6 @@ def test_action_grid_is_the_papers():
     np.testing.assert_allclose(np.diff(rates), 0.00125)
     with pytest.raises(ValueError, match="allowed >= 2"):
         pump_rates(1)  # which could not stop
-
-
-def test_ten_euler_steps_of_a_tenth_of_a_minute():
-    """f = (1 + h (mu - u/tau))^10, written out here a second time."""
-    config = EnvConfig(mu=0.023, tau=0.29)
-    expected = (1.0 + 0.1 * (0.023 - config.pump_rates() / 0.29)) ** 10
-    np.testing.assert_allclose(step_factors(config), expected, rtol=1e-14)
-
-
-def test_fine_runge_kutta_steps_approach_the_exponential():
-    config = EnvConfig(integrator="rk4", substeps=50)
-    exact = np.exp(config.mu - config.pump_rates() / config.tau)
-    np.testing.assert_allclose(step_factors(config), exact, rtol=1e-12)
-
-
-def test_reward_is_minus_the_squared_error():
-    np.testing.assert_allclose(tracking_reward(np.array([0.5, 0.7]), np.array([0.5, 0.4])), [0.0, -0.09])
 
 
 @pytest.mark.parametrize(("period_s", "stale_s"), [(30.0, 70.0), (60.0, 100.0), (120.0, 160.0), (600.0, 660.0)])

@@ -13,7 +13,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.species import SecondSpeciesConfig
 from envs.plant.thermal import ThermalConfig
 from envs.plant.vessel import VesselConfig
-from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate, steady_production
+from tests.two_species import p_putida_rate, steady_production
 
 QUIET = FluorescenceConfig(noise_sd=0.0)
 STEADY = ThermalConfig(medium_c=37.0, heating_c_per_min=10.0)
@@ -32,14 +32,6 @@ def pair(**changes) -> PlantConfig:
 
 def logit(share):
     return np.log(share / (1.0 - share))
-
-
-@pytest.mark.parametrize("temperature", [29.0, 31.0, EQUAL_RATES_C, 35.0, 36.0])
-def test_the_preset_grows_by_the_published_curves(temperature) -> None:
-    p = plant(build(PlantConfig(), load("plant/coculture")))
-    p.reset(temperature=temperature)
-    rates = [[float(e_coli_rate(temperature)), float(p_putida_rate(temperature))]]
-    np.testing.assert_allclose(60.0 * p.culture.rates(p.age_min), rates, rtol=1e-7)
 
 
 @pytest.mark.parametrize("dosing", ["continuous", "pulse"])
@@ -132,28 +124,6 @@ def test_a_share_outside_its_range_is_refused() -> None:
 
 
 # -- pyoverdine and its light ------------------------------------------------------------------------------------------
-
-
-def test_pigment_settles_where_production_meets_dilution() -> None:
-    """At a held composition and constant dilution f = g p / D, with D the growth of both."""
-    alike = SecondSpeciesConfig((0.4, 0.4), mu=0.02)
-    p = plant(pair(second=alike, start_temperature=33.0, thermal=replace(STEADY, medium_c=33.0)))
-    p.fluorescence.pigment[:] = 0.0
-    for _ in range(800):
-        p.advance(1.0, np.array([0.02 * 20.0]))
-    f = float(steady_production(33.0)) * 0.2 / (60.0 * 0.02)
-    assert p.culture.od[0] == pytest.approx(0.5, rel=1e-6)
-    assert p.fluorescence.pigment[0] == pytest.approx(f, rel=1e-6)
-    assert p.read_fluorescence()[0] == pytest.approx(f + 150.0 * 0.5 + 214.0, rel=1e-6)
-
-
-def test_pigment_starts_in_balance_with_undiluted_growth() -> None:
-    """f' = g p and p' = mu p keep f / p = g / mu."""
-    p = plant(pair(start_temperature=33.0, thermal=STEADY))
-    ratio = p.fluorescence.pigment / p.culture.biomass[:, 1]
-    for _ in range(60):
-        p.advance(1.0, np.zeros(1))
-    np.testing.assert_allclose(p.fluorescence.pigment / p.culture.biomass[:, 1], ratio, rtol=1e-4)
 
 
 def test_production_answers_at_once_and_overshoots_after_the_delay() -> None:
