@@ -45,25 +45,6 @@ def load_deploy(*overrides: str):
     return frame.load(cfg, DeployConfig())
 
 
-def said(group: str, option: str) -> dict[str, Any]:
-    """What the file of a preset and those it stands on say, read by nothing but YAML."""
-    own = yaml.safe_load((CONF / group / f"{option}.yaml").read_text()) or {}
-    values: dict[str, Any] = {}
-    for below in own.pop("defaults", []):
-        if below != "_self_":
-            merge(values, said(group, below))
-    merge(values, own)
-    return values
-
-
-def merge(into: dict[str, Any], values: dict[str, Any]) -> None:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            merge(into.setdefault(key, {}), value)
-        else:
-            into[key] = value
-
-
 def plain(value: Any) -> Any:
     """Tuples as YAML has them."""
     return [plain(one) for one in value] if isinstance(value, tuple | list) else value
@@ -87,7 +68,7 @@ COMPOSED = {"env": load_train, "agent": load_train, "scenario": load_deploy, "pl
 @pytest.mark.parametrize(("group", "option"), [(group, option) for group in COMPOSED for option in options(group)])
 def test_every_preset_composes_to_what_its_file_says(group, option):
     """The minutes of a scenario are those of its steps together; a task is of its own kind."""
-    config, values = COMPOSED[group](f"{group}={option}"), said(group, option)
+    config, values = COMPOSED[group](f"{group}={option}"), presets.load(f"{group}/{option}")
     found = getattr(config, group)
     assert held(found, values) == {}
     if group == "scenario":
@@ -118,6 +99,7 @@ ROOTS = {
     "scenario": Scenario,
     "backend/transport": TransportConfig,
 }
+BACKENDS = {"sim": SimulatedConfig(), "chibio": ChiBioConfig(), "emulator": EmulatorConfig()}
 
 
 def repeated(values: dict[str, Any], default: Any, prefix: str = "") -> list[str]:
@@ -132,7 +114,10 @@ def repeated(values: dict[str, Any], default: Any, prefix: str = "") -> list[str
     return found
 
 
-@pytest.mark.parametrize("name", [f"{group}/{option}" for group in ROOTS for option in options(group)])
+@pytest.mark.parametrize(
+    "name",
+    [*(f"{group}/{option}" for group in ROOTS for option in options(group)), *(f"backend/{name}" for name in BACKENDS)],
+)
 def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
     group = name.rpartition("/")[0]
     own = yaml.safe_load((CONF / f"{name}.yaml").read_text()) or {}
@@ -143,19 +128,11 @@ def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
         assert all(getattr(kind(), key) != value for key, value in own.items())
     elif name in STATED:
         assert build(STATED[name], own) == STATED[name]
+    elif group == "backend":
+        config = BACKENDS[name.rpartition("/")[2]]
+        assert (repeated(own, config), own["kind"]) == ([], config.kind)
     else:
         assert repeated(own, ROOTS[group]()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "config"),
-    [("backend/sim", SimulatedConfig()), ("backend/chibio", ChiBioConfig()), ("backend/emulator", EmulatorConfig())],
-)
-def test_a_backend_holds_only_what_differs_from_the_dataclass(name, config):
-    own = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    own.pop("defaults", None)
-    assert repeated(own, config) == []
-    assert own["kind"] == config.kind
 
 
 COMMANDS = sorted(p.stem for p in CONF.glob("*.yaml") if p.stem != "base")
@@ -294,22 +271,15 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
     ("name", "override", "parts"),
     [
         ("train", "env.mu=abc", ["env.mu", "abc", "a number, 0 < mu"]),
-        ("train", "env.mu=nan", ["env.mu", "nan", "allowed"]),
-        ("train", "env.nois=1", ["env.nois", "no such key", "mu, tau"]),
         ("train", "foo=1", ["foo", "no such key", "n_agents"]),
         ("train", "lr=1", ["lr", "agent.learning_rate", "env, agent"]),
         ("train", "env=simm", ["env=simm", "no such option", "sim"]),
         ("train", "+experiment=nope", ["experiment=nope", "no such option", "smoke"]),
-        ("train", "seed=1.5", ["seed", "1.5", "a whole number"]),
-        ("train", "agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
-        ("train", "agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
         ("train", "env=null", ["group"]),
         ("train", "agent.hidden=[", ["["]),
         ("train", "seed=range(0,4)", ["seed=range(0,4)", "-m 'seed=range(0,4)'"]),
         ("train", "seed=1,2", ["seed=1,2", "-m 'seed=1,2'"]),
-        ("train", "agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: ", "hindsight_share"]),
-        ("train", "++agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: "]),
-        ("train", "+agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: "]),
+        ("train", "+agent.relabelled=0.5", ["agent.relabelled: no such key; allowed under agent: ", "hindsight_share"]),
         ("deploy", "controller=turbidostat", ["controller=turbidostat: no such option; allowed: ", "threshold"]),
         ("train", "+experiment=paper", ["experiment=paper: a recipe of benchmark"]),
         ("benchmark", "experiment=smoke", ["experiment=smoke: a recipe of train"]),

@@ -20,7 +20,6 @@ PRESETS = [name for name in PRESETS if not name.startswith(RECIPES)]
 class Inner:
     rate: float = setting(0.5, "a rate", "mL/s", above=0.0, at_most=1.0)
     law: str = setting("none", "a law", choices=("none", "cubic"))
-    spare: str = setting("", "a pump", choices=("Pump3", "Pump4", ""))
     span: tuple[float, float] = setting((0.1, 1.1), "a range", "OD", above=0.0, at_most=4.0, interval=True)
 
     def __post_init__(self) -> None:
@@ -34,7 +33,6 @@ class Outer:
     goals: tuple[float, ...] = setting((0.5,), "goals", "OD", above=0.0, at_most=1.5, some=True)
     count: int | None = setting(None, "how many", at_least=1)
     on: bool = setting(True, "a switch")
-    budget: float = setting(1.0, "a budget", "mL", above=0.0, below=float("inf"))
     named: dict[str, Inner] = setting({}, "parts by name")
     free: dict[str, Any] = setting({}, "anything")
     whatever: Any = part(Inner, "a part of any kind")
@@ -48,19 +46,14 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
     assert Outer().named is not Outer().named
 
 
-INNER, OUTER = "rate, law, spare, span", "inner, share, goals, count, on, budget, named, free, whatever"
+INNER, OUTER = "rate, law, span", "inner, share, goals, count, on, named, free, whatever"
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"inner": {"rate": 0}}, "outer.inner.rate = 0.0 mL/s: allowed 0 < rate <= 1"),
-        ({"inner": {"rate": "nan"}}, "outer.inner.rate = nan mL/s: allowed 0 < rate <= 1"),
         ({"inner": {"rate": "fast"}}, "inner.rate = fast: allowed a number, 0 < rate <= 1"),
         ({"inner": {"rate": True}}, "inner.rate = True: allowed a number, 0 < rate <= 1"),
-        ({"inner": {"law": "square"}}, "outer.inner.law = square: allowed none, cubic"),
-        ({"inner": {"spare": "Pump1"}}, "outer.inner.spare = Pump1: allowed Pump3, Pump4, or '' for none"),
-        ({"inner": {"span": [2, 1]}}, "outer.inner.span = [2.0, 1.0]: allowed [low, high] with 0 < low <= high <= 4"),
         ({"inner": {"span": [2]}}, "outer.inner.span = [2.0]: allowed [low, high] with 0 < low <= high <= 4"),
         ({"inner": {"law": None}}, "inner.law = None: allowed text"),
         ({"inner": 3}, "inner = 3: allowed keys and values, as inner.NAME=VALUE"),
@@ -68,17 +61,11 @@ INNER, OUTER = "rate, law, spare, span", "inner, share, goals, count, on, budget
         ({"inner": {"span": [0.1, "x"]}}, "inner.span[1] = x: allowed a number"),
         ({"law": "cubic"}, "law: no such key; did you mean inner.law?; allowed here: " + OUTER),
         ({"lhh": 3}, "lhh: no such key; allowed here: " + OUTER),
-        ({"share": 2}, "share = 2.0: allowed 0 to 1"),
-        ({"goals": [0.5, 2]}, "goals = [0.5, 2.0]: allowed one or more, each 0 < OD <= 1.5"),
-        ({"goals": []}, "goals = []: allowed one or more, each 0 < OD <= 1.5"),
         ({"goals": 0.5}, "goals = 0.5: allowed a list, as [1,2]"),
         ({"goals": [0.5, "x"]}, "goals[1] = x: allowed a number, 0 < OD <= 1.5"),
-        ({"count": 0}, "count = 0: allowed at least 1, or null"),
         ({"count": 1.5}, "count = 1.5: allowed a whole number, at least 1"),
         ({"on": "perhaps"}, "on = perhaps: allowed true or false"),
-        ({"budget": "inf"}, "budget = inf mL: allowed a finite number greater than 0"),
         ({"named": {"a": {"rate": 2}}}, "outer.inner.rate = 2.0 mL/s: allowed 0 < rate <= 1"),
-        ({"nois": 1}, "nois: no such key; allowed here: " + OUTER),
     ],
 )
 def test_what_is_wrong_is_one_line_with_key_value_and_range(values, message):

@@ -144,20 +144,16 @@ def killed_run(
     return findings
 
 
+@dataclass
 class Clients:
     """The client processes of one run, one after another. What goes wrong with them is added to `findings`."""
 
-    def __init__(
-        self,
-        config: KillConfig,
-        device: EmulatorProcess,
-        folder: Path,
-        rng: np.random.Generator,
-        findings: Findings,
-        stop: threading.Event,
-    ) -> None:
-        self.config, self.device, self.folder, self.findings = config, device, folder, findings
-        self._rng, self._stop = rng, stop
+    config: KillConfig
+    device: EmulatorProcess
+    folder: Path
+    rng: np.random.Generator
+    findings: Findings
+    stop: threading.Event
 
     def start(self) -> Client:
         """A client: the first, or one that resumes the run."""
@@ -181,7 +177,7 @@ class Clients:
     def _until_it_writes(self, client: Client, before: int) -> bool:
         deadline = time.monotonic() + PATIENCE_S
         while self._size() <= before and client.status is None and time.monotonic() < deadline:
-            if self._stop.wait(0.01):
+            if self.stop.wait(0.01):
                 break
         return client.status is None and self._size() > before
 
@@ -192,18 +188,18 @@ class Clients:
         """
         has_state = (self.folder / "state.json").exists()
         client = self.start()
-        early = has_state and self._rng.random() < self.config.early
+        early = has_state and self.rng.random() < self.config.early
         if early:
-            self._stop.wait(float(self._rng.uniform(0.5, 3.0)))
+            self.stop.wait(float(self.rng.uniform(0.5, 3.0)))
         elif self._until_it_writes(client, self._size()):
-            self._stop.wait(float(self._rng.uniform(0.0, self.config.longest_s)))
-            while not ((self.folder / "state.json").exists() or self._stop.wait(0.05)) and client.status is None:
+            self.stop.wait(float(self.rng.uniform(0.0, self.config.longest_s)))
+            while not ((self.folder / "state.json").exists() or self.stop.wait(0.05)) and client.status is None:
                 pass
         if client.status is not None:
             self.findings.trouble.append(f"client {k} ended by itself with status {client.status}")
         killed = time.time()
         client.kill()
-        if self._stop.is_set():
+        if self.stop.is_set():
             raise Stopped
         return killed
 
@@ -211,36 +207,34 @@ class Clients:
         """Resume once more, run ten minutes, end as an operator would; returns the wall time of that, s."""
         client = self.start()
         if self._until_it_writes(client, self._size()):
-            self._stop.wait(LAST_S / self.config.speed)
+            self.stop.wait(LAST_S / self.config.speed)
         ended = time.time()
         if client.end(30.0, signal.SIGINT) is None:
             self.findings.trouble.append("the last client did not end on SIGINT")
         return ended
 
 
+@dataclass
 class Comparison:
     """What the emulator knows against journal and recordings.
 
-    Args: killed: wall time of every kill. ended: when the last client was asked to end. findings: are filled in.
+    killed: wall time of every kill. ended: when the last client was asked to end. findings: are filled in.
     """
 
-    def __init__(
-        self,
-        config: KillConfig,
-        device: EmulatorProcess,
-        folder: Path,
-        killed: Sequence[float],
-        ended: float,
-        findings: Findings,
-    ) -> None:
-        self.config, self.device, self.folder, self.findings = config, device, folder, findings
-        self._killed, self._ended = killed, ended
+    config: KillConfig
+    device: EmulatorProcess
+    folder: Path
+    killed: Sequence[float]
+    ended: float
+    findings: Findings
+
+    def __post_init__(self) -> None:
         before = time.time()
         self._truth = self._ask("truth")
         after = time.time()
         self._clocks_s = max(CLOCKS_S, (after - before) / 2.0)
-        self._wall_zero = (before + after) / 2.0 - self._truth[config.reactors[0]]["device_s"] / config.speed
-        self._journal, _ = read_journal(folder / "journal.jsonl")
+        self._wall_zero = (before + after) / 2.0 - self._truth[self.config.reactors[0]]["device_s"] / self.config.speed
+        self._journal, _ = read_journal(self.folder / "journal.jsonl")
         self._zero = self._device_s(self._journal[0]["wall"])
 
     def _ask(self, what: str) -> Any:
@@ -255,7 +249,7 @@ class Comparison:
         f, c, truth, journal = self.findings, self.config, self._truth, self._journal
         f.pumps_off = not any(any(truth[m]["motors"].values()) for m in c.reactors)
         f.overflowed = any(truth[m]["overflowed"] for m in c.reactors)
-        f.killed_s = [round(self._device_s(t) - self._zero, 1) for t in self._killed]
+        f.killed_s = [round(self._device_s(t) - self._zero, 1) for t in self.killed]
         times = [(r["wall"], r["time_s"]) for r in journal if r["kind"] == "sample"]
         f.schedule_error_s = max(abs(self._device_s(wall) - self._zero - time_s) for wall, time_s in times)
         for name in c.reactors:
@@ -282,7 +276,7 @@ class Comparison:
             f.booked_ml += float(row["feed_ml"])
             at = row["on_s"] + self._zero
             given = ((starts > at - 3.0) & (starts < at + 45.0)).any()
-            ends = (*self._killed, self._ended)  # asked to end, a client cuts its dose as short as a kill does
+            ends = (*self.killed, self.ended)  # asked to end, a client cuts its dose as short as a kill does
             killed = any(row["wall"] - 0.1 <= t <= row["wall"] + 2.0 * self.config.answer_s for t in ends)
             f.doses_not_given += int(not given)
             if not given and not killed and "no dose" not in str(following.get("note")):
@@ -325,7 +319,7 @@ class Comparison:
 
         It watches from its start, or from where it took over a reactor that did not answer then.
         """
-        ends = np.array([self._device_s(t) for t in [*self._killed, self._ended]])
+        ends = np.array([self._device_s(t) for t in [*self.killed, self.ended]])
         k = int(np.searchsorted(ends, at))  # the client that watched then, or the one after the pause
         if k == ends.size:
             return None
@@ -336,7 +330,7 @@ class Comparison:
         return None if max(begun) > at else (float(max(begun)), float(ends[k]))
 
     def _settled(self, at: float, life: Life) -> bool:
-        return life[1] == self._device_s(self._ended) and at >= life[0] + SETTLING_S
+        return life[1] == self._device_s(self.ended) and at >= life[0] + SETTLING_S
 
 
 def errors_in_lives(seen: Sequence[tuple[float, float, Life]]) -> list[float]:

@@ -30,10 +30,8 @@ NERVOUS = replace(STUCK, mu_max=0.001, drift=0.01, noise_od=0.0, noise_fraction=
 """Takes growth for a blocked pump, and never doses again."""
 
 
-def run(
-    fault: Fault | None, safety: SafetyConfig | None = None, controller: str = "inverse", moment: str = "dose"
-) -> Outcome:
-    return ChiBioCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, controller), 3).run()
+def run(fault: Fault, safety: SafetyConfig | None = None) -> Outcome:
+    return ChiBioCase(fault, "dose", rehearsed(("M0", "M1"), SCHEDULE, safety, "inverse"), 3).run()
 
 
 def mute(*silent: int) -> Act:

@@ -64,6 +64,15 @@ def _filled(config: DQNConfig, seeds: range) -> DQNAgent:
     return agent
 
 
+def test_a_minibatch_is_of_the_rows_that_each_agent_s_own_numbers_choose() -> None:
+    """A number in [0, 1) is a share of the 40 rows in the memory."""
+    agent = _filled(SMALL, range(3))
+    rows, chosen = agent.replay.state_dict()["rows"], agent._minibatches(1).s_tm1[:, 0]
+    for i in range(3):
+        draws = np.random.default_rng(streams(range(i, i + 1))["replay"][0]).random(SMALL.batch_size)
+        assert torch.equal(chosen[i], rows[i][(draws * 40).astype(int), :3])
+
+
 @pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
 @pytest.mark.parametrize("together", [4, 5, 200])
 def test_updates_of_one_step_are_those_that_are_made_one_by_one(changes: dict[str, Any], together: int) -> None:

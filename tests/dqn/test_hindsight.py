@@ -1,5 +1,7 @@
 """Relabelled transitions: still true, goals where they are said to be."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -65,20 +67,26 @@ def test_a_state_outside_all_setpoints_gets_a_far_goal() -> None:
     assert float(goal.std()) > 0.2
 
 
+def _both(
+    relabel: ShiftRelabel | ProgramRelabel, width: int, step: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+) -> tuple[Transition, Transition]:
+    """A batch in which an action moves the first number of an observation by `step`; and the same relabelled."""
+    generator = torch.Generator().manual_seed(2)
+    before = torch.rand(AGENTS, BATCH, width, generator=generator)
+    action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
+    after = before.clone()
+    after[..., 0] += step(before, action)
+    old = Transition(before, action, torch.zeros(AGENTS, BATCH), after, torch.ones(AGENTS, BATCH))
+    new, generator = Transition(*(field.clone() for field in old)), torch.Generator().manual_seed(1)
+    uniform = torch.rand(AGENTS, BATCH, relabel.numbers, generator=generator, dtype=torch.float64)
+    relabel.replace(new, relabel.drawn(uniform))
+    return old, new
+
+
 def _shifted(near: float) -> tuple[Transition, Transition]:
-    """A batch of e' = e + s - v and the same with other setpoints."""
-    batches = []
-    for _ in range(2):
-        generator = torch.Generator().manual_seed(2)
-        before = torch.rand(AGENTS, BATCH, 2, generator=generator)
-        action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
-        after = before.clone()
-        after[..., 0] += before[..., 1] - action / 16.0
-        batches.append(Transition(before, action, -(after[..., 0] ** 2), after, torch.ones(AGENTS, BATCH)))
+    """Transitions of e' = e + s - v."""
     relabel = ShiftRelabel(DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), 1.2, lambda e: -e * e)
-    uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    relabel.replace(batches[1], relabel.drawn(uniform))
-    return batches[0], batches[1]
+    return _both(relabel, 2, lambda before, action: before[..., 1] - action / 16.0)
 
 
 @pytest.mark.parametrize("near", [0.0, 0.4, 1.0])
@@ -109,24 +117,12 @@ def test_near_goals_cover_every_order_of_magnitude_on_both_sides() -> None:
 
 
 def _program(near: float, preview: float) -> tuple[Transition, Transition]:
-    """Transitions of x' = x + (a - 8) / 20 under a setpoint, with or without an announced change; and relabelled."""
-    batches, width = [], 4 if preview else 2
-    for _ in range(2):
-        generator = torch.Generator().manual_seed(3)
-        before = torch.rand(AGENTS, BATCH, width, generator=generator)
-        action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
-        after = before.clone()
-        after[..., 0] += (action - 8) / 20.0
-        batches.append(Transition(before, action, torch.zeros(AGENTS, BATCH), after, torch.ones(AGENTS, BATCH)))
+    """Transitions of x' = x + (a - 8) / 20 under a setpoint, with or without an announced change."""
     relabel = ProgramRelabel(
         DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), 3.0, lambda u: 4.0 * u - 2.0,
         lambda x, setpoint: -torch.square(x - setpoint), 1, 30.0, preview,
     )  # fmt: skip
-    numbers = torch.rand(
-        AGENTS, BATCH, relabel.numbers, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
-    relabel.replace(batches[1], relabel.drawn(numbers))
-    return batches[0], batches[1]
+    return _both(relabel, 4 if preview else 2, lambda before, action: (action - 8) / 20.0)
 
 
 @pytest.mark.parametrize("near", [0.0, 0.5])

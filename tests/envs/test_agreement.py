@@ -12,10 +12,11 @@ from envs.identification.agreement import Agreement, Compared, agreement
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.plant.culture import GrowthConfig
-from envs.plant.plant import Plant, PlantConfig
+from envs.plant.plant import PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
+from tests.envs.test_twin import controlled
 
 pytestmark = pytest.mark.numeric
 
@@ -31,15 +32,7 @@ GOALS = (0.8, 0.65, 0.5, 0.7)
 
 def runs(config: PlantConfig, hours: float, n: int = 4, seed: int = 3) -> list[Series]:
     """Recordings of n vials under the device's PI, with a setpoint of its own for each quarter."""
-    plant, controller = Plant(config, n, np.random.default_rng(seed)), ChiBioPI(ChiBioPIConfig())
-    controller.reset(n)
-    time = np.arange(60.0 * hours + 1.0)
-    od, rate = np.empty((n, time.size)), np.empty((n, time.size))
-    for i, minute in enumerate(time):
-        goal = GOALS[min(i * len(GOALS) // time.size, len(GOALS) - 1)]
-        od[:, i] = plant.read_od()
-        rate[:, i] = controller.act(od[:, i], np.full(n, goal), np.full(n, minute), np.ones(n, dtype=np.bool_))
-        plant.advance(1.0, 60.0 * rate[:, i])
+    time, od, rate = controlled(config, ChiBioPI(ChiBioPIConfig()), GOALS, seed, n, round(60.0 * hours))
     return [Series(time, y, u, np.arange(time.size)) for y, u in zip(od, rate, strict=True)]
 
 

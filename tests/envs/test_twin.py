@@ -20,6 +20,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from experiments.calibration.twin_file import plant_of, twin_yaml
+from experiments.laws.base import Controller
 from experiments.laws.density.baselines import Threshold, ThresholdConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
@@ -43,14 +44,21 @@ each_law = pytest.mark.parametrize(
 
 
 def record(config: PlantConfig, law: str, seed: int, n: int = 1, minutes: int = MINUTES) -> tuple[Array, Array, Array]:
-    """Minutes (T,), OD and pump rate (N, T) of vials under a law, as a device would record them."""
-    plant, goals = Plant(config, n, np.random.default_rng(seed)), LAWS[law]
+    """Return what `controlled` does under a law with its setpoints."""
     controller = ChiBioPI(ChiBioPIConfig()) if law == "pi" else Threshold(ThresholdConfig())
+    return controlled(config, controller, LAWS[law], seed, n, minutes)
+
+
+def controlled(
+    config: PlantConfig, controller: Controller, goals: tuple[float, ...], seed: int, n: int, minutes: int
+) -> tuple[Array, Array, Array]:
+    """Minutes (T,), OD and pump rate (N, T) of vials under control, as a device would record them."""
+    plant = Plant(config, n, np.random.default_rng(seed))
     controller.reset(n)
     time = np.arange(minutes + 1.0)
     od, rate = np.empty((n, time.size)), np.empty((n, time.size))
     for i, minute in enumerate(time):
-        goal = goals[min(i * len(goals) // MINUTES, len(goals) - 1)]
+        goal = goals[min(i * len(goals) // minutes, len(goals) - 1)]
         od[:, i] = plant.read_od()
         rate[:, i] = controller.act(od[:, i], np.full(n, goal), np.full(n, minute), np.ones(n, dtype=np.bool_))
         plant.advance(1.0, 60.0 * rate[:, i])
