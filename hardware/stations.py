@@ -47,7 +47,7 @@ class Plan:
     carry_ml: float = 0.0
 
 
-class Doses(Protocol):
+class AnyDoses(Protocol):
     """carry_ml: put off to the next dose. extra: what was given beyond what was booked when doses began."""
 
     extra: list[Given]
@@ -68,7 +68,7 @@ class Station(Protocol):
     @property
     def name(self) -> str: ...
     @property
-    def doses(self) -> Doses: ...
+    def doses(self) -> AnyDoses: ...
     @property
     def newest(self) -> Newest: ...
     @property

@@ -179,6 +179,12 @@ def test_the_ways_through_the_code_name_functions_that_exist():
             assert re.search(rf"\b(?:def|class) {name}\b|^{name}\b", text, re.MULTILINE), f"{file}: {name}"
 
 
+def test_a_class_has_a_name_of_its_own():
+    """One that occurs twice means two things; `_Private` ones are seen in their file alone."""
+    names = [node.name for m in modules() for node in tree(m).body if isinstance(node, ast.ClassDef)]
+    assert sorted(name for name in names if names.count(name) > 1 and name[0] != "_") == []
+
+
 def test_no_random_numbers_are_seeded_from_a_clock() -> None:
     """A failure that nobody can repeat teaches nothing."""
     found = []

@@ -20,7 +20,7 @@ from hardware.chibio.dose_sequence import REFUSALS, Context
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay
-from hardware.chibio.station import Station
+from hardware.chibio.station import ChibioStation
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, ReactorError
 from hardware.link.transport import SharedLink, Transport
@@ -32,7 +32,7 @@ __all__ = ["ChiBioReactors"]
 SLOWEST_S = 61.0  # a cycle of the device takes at most so long as a rule
 
 
-class ChiBioReactors(Stations[Station, ReactorHistory]):
+class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
     """One to eight Chi.Bio reactors behind one server; `end` ends the experiments too.
 
     Args:
@@ -59,12 +59,12 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         self._agenda = Agenda(clock)
         self.stations = tuple(map(self._station, config.reactors, calibrations))
 
-    def _station(self, name: str, calibration: ReactorCalibration) -> Station:
+    def _station(self, name: str, calibration: ReactorCalibration) -> ChibioStation:
         connection = Connection(name, self.config.permitted, self._link, self._clock, self.note_down)
         book = Logbook(name, self.note_down, self.write, self.elapsed)
         past = partial(self._past.__getitem__, name)
         volume_ml = self._bench.volume_of(name)
-        return Station(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
+        return ChibioStation(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
 
     def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
         """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
@@ -104,7 +104,7 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
                 station.book.say(f"not taken over, the others go on and this one is tried again: {error}")
         self._bring_up([station for station in self.stations if station.restored], resumed=bool(histories))
 
-    def _bring_up(self, stations: Sequence[Station], resumed: bool) -> None:
+    def _bring_up(self, stations: Sequence[ChibioStation], resumed: bool) -> None:
         """Each into its running state, starts staggered inside the minute; a resumed run goes on meanwhile."""
         slot = 0
         for station in stations:
@@ -146,10 +146,10 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         super().stop()
         self._link.disarm()
 
-    def _silence(self, stations: Sequence[Station]) -> dict[Station, ReactorError]:
+    def _silence(self, stations: Sequence[ChibioStation]) -> dict[ChibioStation, ReactorError]:
         """All pumps of these off, again and again, then by the end of their experiments; what could not be verified."""
 
-        def failed(pending: Sequence[Station]) -> dict[Station, ReactorError]:
+        def failed(pending: Sequence[ChibioStation]) -> dict[ChibioStation, ReactorError]:
             return self._all(pending, lambda station: station.doses.settle(overflow_pump=True))
 
         deadline, tries = self._clock.now() + self.config.stop_s, 1

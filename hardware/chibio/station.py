@@ -20,7 +20,7 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorE
 from hardware.reactor import Fault
 from hardware.stations import Newest
 
-__all__ = ["Station"]
+__all__ = ["ChibioStation"]
 
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 MEASURING_S = 20.0  # settling, four readings, three temperatures and three fluorescence slots take less
@@ -29,7 +29,7 @@ STARTS = 3  # attempts to start an experiment before it counts as failed
 AGAIN_S = 60.0  # from a restart that failed to the next one
 
 
-class Station:
+class ChibioStation:
     """One reactor under control.
 
     Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy, while the reactor is being

@@ -31,7 +31,7 @@ from hardware.stations import Plan
 from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given, feeds_by
 
-__all__ = ["Doses", "History", "replay"]
+__all__ = ["Doses", "UnitHistory", "replay"]
 
 DRAIN_ML = 4.0  # at a time and more, while a media pump runs on
 DRAINS = 5  # attempts to empty a vial after that
@@ -39,7 +39,7 @@ UNSEEN = "its end was not on record: at most what was asked, unless its pump was
 
 
 @dataclass(frozen=True)
-class History(history_of.History):
+class UnitHistory(history_of.History):
     """One unit's past; boot, when it had been started; of an open dose pump, id and task, the answer to its request."""
 
     boot: str = ""
@@ -60,9 +60,9 @@ class History(history_of.History):
         return known
 
 
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, History]:
+def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, UnitHistory]:
     """Replay the journal of a run for each unit. Args: rows: oldest first. Raises: RecordingError."""
-    return history_of.replayed(rows, History())
+    return history_of.replayed(rows, UnitHistory())
 
 
 class Doses:
@@ -92,7 +92,7 @@ class Doses:
         """Whether a dose is under way, or the fate of one unknown."""
         return self._course is not None
 
-    def restore(self, history: History) -> None:
+    def restore(self, history: UnitHistory) -> None:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
         if history.open:
@@ -178,7 +178,7 @@ class Doses:
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
 
-    def _look_for(self, history: History, plan: Plan) -> Iterator[float]:
+    def _look_for(self, history: UnitHistory, plan: Plan) -> Iterator[float]:
         """Look for the dose an earlier life left open: what became of it while nobody watched, and what still may."""
         pumps, dose, asked_ml = self.pumps, history.id, plan.feed_ml
         media, waste = Moved(), Moved()

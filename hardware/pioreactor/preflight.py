@@ -11,7 +11,7 @@ from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS
 from hardware.pioreactor.pumps import NAMES, STEP_S, Barrier, driven
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.station import UNHEARD, Station
+from hardware.pioreactor.station import UNHEARD, PioreactorStation
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.pioreactor.web import NotHeard, Web
 
@@ -36,7 +36,7 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
     return checks
 
 
-def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
+def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[Check]:
     """Check one unit. Raises: ReactorError where it does not answer."""
     unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
     health = web.get("/health")
@@ -112,7 +112,7 @@ def _queue(name: str, web: Web) -> Check:
     return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")
 
 
-def _pins(station: Station) -> Check:
+def _pins(station: PioreactorStation) -> Check:
     """Whether the unit tells what its pins do."""
     for _ in station.hear_pins():
         station.unit.real.sleep(STEP_S)

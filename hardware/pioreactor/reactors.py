@@ -9,9 +9,9 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.logbook import Log, Logbook, no_log
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.doses import History
+from hardware.pioreactor.doses import UnitHistory
 from hardware.pioreactor.mailbox import Cluster, Mailbox
-from hardware.pioreactor.station import Station
+from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.web import Web
 from hardware.stations import Stations
@@ -23,7 +23,7 @@ LOOK_S, FIRST_S = 0.05, 30.0  # real seconds between two looks; until the broker
 screen = logging.getLogger(__name__)
 
 
-class PioreactorReactors(Stations[Station, History]):
+class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
     """Units of one cluster; `close` after `stop`.
 
     Args: config: units and how to reach them. real: clock of messages and jobs; the run's is `config.speed` times as
@@ -42,7 +42,7 @@ class PioreactorReactors(Stations[Station, History]):
         self.leader = Web((config.leader or f"http://{config.broker}").rstrip("/"), config.experiment)
         self.mqtt = Cluster(config, boxes, f"turbidostat-{run}-{config.reactors[0]}", real)
         self.stations = tuple(
-            Station(
+            PioreactorStation(
                 Unit(
                     name, config.of(name), bench, bench.volume_of(name), Web(config.address(name), config.experiment),
                     self.leader, self.mqtt, box, clock, Logbook(name, self.note_down, self.write, self.elapsed), run,
@@ -51,13 +51,13 @@ class PioreactorReactors(Stations[Station, History]):
             for name, box in boxes.items()
         )  # fmt: skip
 
-    def _take_over(self, histories: Mapping[str, History]) -> None:
+    def _take_over(self, histories: Mapping[str, UnitHistory]) -> None:
         """Versions and calibrations read, jobs adopted or started, open doses of an earlier life looked for."""
         self.connect()
         self.mqtt.hold()
         if others := [other for unit in self.names if (other := self.mqtt.holder(unit))]:
             raise DeviceStateError(others[0])
-        past = {station: histories.get(station.name, History()) for station in self.stations}
+        past = {station: histories.get(station.name, UnitHistory()) for station in self.stations}
         failed = self._all(self.stations, lambda station: station.bring_up(past[station]))
         for station, error in failed.items():
             if not histories or len(failed) == len(past):
@@ -81,10 +81,10 @@ class PioreactorReactors(Stations[Station, History]):
         self._real.sleep(LOOK_S)
 
     def _all(
-        self, stations: Sequence[Station], action: Callable[[Station], Iterator[float]]
-    ) -> dict[Station, ReactorError]:
+        self, stations: Sequence[PioreactorStation], action: Callable[[PioreactorStation], Iterator[float]]
+    ) -> dict[PioreactorStation, ReactorError]:
         """Go through the stations' courses side by side, while the other units go on; what failed."""
-        courses, failed = {station: action(station) for station in stations}, dict[Station, ReactorError]()
+        courses, failed = {station: action(station) for station in stations}, dict[PioreactorStation, ReactorError]()
         while courses:
             for station, course in list(courses.items()):
                 try:
@@ -100,7 +100,7 @@ class PioreactorReactors(Stations[Station, History]):
             self._real.sleep(LOOK_S)
         return failed
 
-    def _silence(self, stations: Sequence[Station]) -> dict[Station, ReactorError]:
+    def _silence(self, stations: Sequence[PioreactorStation]) -> dict[PioreactorStation, ReactorError]:
         """All pumps of these off, what empties a vial too; what could not be verified."""
         return self._all(stations, lambda station: station.end_pumps(self.config.stop_s, final=True))
 

@@ -9,17 +9,17 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from hardware.errors import DeviceStateError, LinkError, ReactorError
-from hardware.pioreactor.doses import Doses, History
+from hardware.pioreactor.doses import Doses, UnitHistory
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import AUTOMATIONS, PUMPS
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Barrier, Calls, Pumps, boot_of
-from hardware.pioreactor.sampling import Sampling
+from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import facts
 from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
 
-__all__ = ["UNHEARD", "Station"]
+__all__ = ["UNHEARD", "PioreactorStation"]
 
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
 RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
@@ -30,7 +30,7 @@ UNHEARD = "the unit told nothing of its pins when one was switched, so no dose c
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
-class Station:
+class PioreactorStation:
     """One unit of a cluster.
 
     Attributes: regulated_od, OD at which the vendor's turbidostat was started, nan if it was not; level_ml, that the
@@ -46,7 +46,7 @@ class Station:
         self._pumps = Pumps(unit)
         self.doses = Doses(self._pumps)
         self._answer = self._pumps.answer
-        self.sampling = Sampling(unit.config, unit.bench.period_s, self._clock.now())
+        self.sampling = UnitSampling(unit.config, unit.bench.period_s, self._clock.now())
         self.regulated_od = self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = False
         self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
@@ -58,7 +58,7 @@ class Station:
 
     # -- bringing up -----------------------------------------------------------------------------------------------
 
-    def bring_up(self, history: History) -> Iterator[float]:
+    def bring_up(self, history: UnitHistory) -> Iterator[float]:
         """Version and calibrations read, jobs adopted or started, an open dose looked for. Raises: ReactorError."""
         self.regulated_od = history.handed_over
         self._pumps.facts = facts(str((yield from self._answer(self._web.get, "/versions/app")).get("version")))
@@ -99,12 +99,12 @@ class Station:
                 yield STEP_S
             yield from self._end_job(STIR) if own else ()
 
-    def lie_down(self, error: ReactorError, history: History) -> None:
+    def lie_down(self, error: ReactorError, history: UnitHistory) -> None:
         """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
         self.book.report(Fault("link", str(error), "the others go on, and this one is tried again"))
         self._course = self._rise(history)
 
-    def _rise(self, history: History) -> Iterator[float]:
+    def _rise(self, history: UnitHistory) -> Iterator[float]:
         again = self._real.now() + GRACE_S
         while self._real.now() < again:
             yield STEP_S

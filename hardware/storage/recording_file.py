@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hardware.errors import RecordingError
 
-__all__ = ["MIN_ROWS", "Layout", "Rows", "Table", "named_rows", "read_table"]
+__all__ = ["MIN_ROWS", "Cells", "Layout", "Rows", "named_rows", "read_table"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -78,7 +78,7 @@ class Layout:
         return list(dict.fromkeys(some if self.temperature is None else [*some, self.temperature]))
 
 
-class Table(NamedTuple):
+class Cells(NamedTuple):
     """Rows of one reactor in file order and house units; nan where a cell is no number. All have the shape (n,).
 
     time_min: of dates and times since 1970 from the first row on. idle: shape (n, pumps not counted), mL/s.
@@ -96,14 +96,14 @@ class Table(NamedTuple):
     width: Numbers
     headers: Numbers
 
-    def only(self, keep: Mask | Numbers) -> "Table":
+    def only(self, keep: Mask | Numbers) -> "Cells":
         """Return the rows of a mask, or at positions."""
-        return Table._make(values[keep] for values in self)
+        return Cells._make(values[keep] for values in self)
 
 
 def read_table(
     path: Path, pump_ml_s: float, pumps: Sequence[int], reactor: str | None, rows: Rows, notes: list[str]
-) -> tuple[Layout, Table]:
+) -> tuple[Layout, Cells]:
     """Read the layout of a file and its rows. Args as of `read_recording`. Raises: RecordingError."""
     cells = _cells(_lines(path, notes), notes)
     try:
@@ -303,12 +303,12 @@ def _of_reactor(path: Path, read: _Read, reactor: str | None, notes: list[str]) 
     return np.isin(read.reactor, (names.index(name), -1))
 
 
-def _in_house_units(layout: Layout, read: _Read) -> Table:
+def _in_house_units(layout: Layout, read: _Read) -> Cells:
     column, n = read.column, len(read.width)
     light = np.prod([column[i] for i in layout.light], axis=0) if layout.light else np.full(n, np.nan)
     if len(layout.light) > 1:  # the Chi.Bio writes a base of 0 while its slot is off
         light[column[layout.light[0]] == 0.0] = np.nan
-    return Table(
+    return Cells(
         time_min=column[layout.time],
         od=column[layout.od],
         pump_rate=layout.ml_s * np.sum([column[i] for i in layout.pumps], axis=0),

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from hardware.errors import RecordingError
-from hardware.storage.recording_file import MIN_ROWS, Layout, Rows, Table, named_rows, read_table
+from hardware.storage.recording_file import MIN_ROWS, Cells, Layout, Rows, named_rows, read_table
 
 __all__ = ["Recording", "read_recording"]
 
@@ -105,7 +105,7 @@ def read_recording(
         raise RecordingError(f"{error} ({'; '.join(notes)})" if notes else str(error)) from None
 
 
-def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[str], doubts: Doubts) -> Recording:
+def _judged(path: Path, source: str, table: Cells, run: int | None, notes: list[str], doubts: Doubts) -> Recording:
     """Build the recording of rows with finite times and rates, without what cannot be used."""
     backward = _backward(path, table.pump_rate, table.number)
     _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
@@ -129,7 +129,7 @@ def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[
     )
 
 
-def _with_times_and_rates(path: Path, table: Table, notes: list[str]) -> Table:
+def _with_times_and_rates(path: Path, table: Cells, notes: list[str]) -> Cells:
     """Keep the rows that have both. Raises: RecordingError when too many have no pump rate, or none has both."""
     width = int(np.median(table.width))
     short = table.width < width
@@ -150,7 +150,7 @@ def _with_times_and_rates(path: Path, table: Table, notes: list[str]) -> Table:
     return table.only(good)
 
 
-def _idle_pumps(layout: Layout, table: Table, pumps: Sequence[int], notes: list[str]) -> Doubts:
+def _idle_pumps(layout: Layout, table: Cells, pumps: Sequence[int], notes: list[str]) -> Doubts:
     """Pumps that ran and are not counted. The waste pump moves at least what all others bring, and dilutes nothing."""
     fed = float(np.nansum(table.pump_rate))
     moved = {pump: abs(float(np.nansum(rate))) for pump, rate in zip(layout.idle, table.idle.T, strict=True)}

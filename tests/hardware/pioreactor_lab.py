@@ -20,7 +20,7 @@ from hardware.clock import VirtualClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.pioreactor import reactors
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.doses import History, replay
+from hardware.pioreactor.doses import UnitHistory, replay
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.web import NotHeard, Web
@@ -554,7 +554,7 @@ class Lab:
     def _log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"n": len(self.rows), "wall": 0.0, "kind": kind, **fields})
 
-    def begin(self, history: History | None = None, elapsed_s: float = 0.0) -> None:
+    def begin(self, history: UnitHistory | None = None, elapsed_s: float = 0.0) -> None:
         self.reactors.begin({UNIT: history} if history else None, elapsed_s)
 
     def sample(self, tries: int = 20) -> Measurement:

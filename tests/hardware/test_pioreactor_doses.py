@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hardware.errors import DeviceStateError, LinkError, RecordingError
-from hardware.pioreactor.doses import History, replay
+from hardware.pioreactor.doses import UnitHistory, replay
 from hardware.pioreactor.pumps import LATE_ML
 from hardware.pioreactor.versions import TESTED
 from hardware.storage.doses import dosed
@@ -325,7 +325,7 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     lab = Lab(monkeypatch)
     lab.world.queue = False
     asked = {"id": "turbidostat/run/pio01/1", "feed_ml": 0.5, "waste_ml": 1.0}
-    past = History(boot="boot1", sample=(1.0, 1), doses=1, open=True, fed=True, **asked)
+    past = UnitHistory(boot="boot1", sample=(1.0, 1), doses=1, open=True, fed=True, **asked)
     lab.begin(past)
     lab.wait(30.0)
     assert not lab.of("dose_end")
@@ -341,7 +341,7 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
 
 def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
     lab = Lab(monkeypatch)
-    lab.begin(History(sample=(1.0, 1), doses=1, open=True, fed=False, id="turbidostat/old/pio01/1", feed_ml=0.5))
+    lab.begin(UnitHistory(sample=(1.0, 1), doses=1, open=True, fed=False, id="turbidostat/old/pio01/1", feed_ml=0.5))
     lab.wait(2.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.0]
 

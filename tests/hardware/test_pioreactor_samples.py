@@ -16,7 +16,7 @@ from hardware.errors import UnfitError
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.family import PioreactorFamily
 from hardware.pioreactor.mailbox import LIVE, LOCKS, WORDS, Cluster, Mailbox, Reading, State
-from hardware.pioreactor.sampling import Sampling
+from hardware.pioreactor.sampling import UnitSampling
 from hardware.safety.config import RAW_MIN
 from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World, sampled
 
@@ -169,7 +169,7 @@ def test_readings_of_another_experiment_or_unit_are_not_ours():
 
 
 def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
-    sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
+    sampling = UnitSampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     values = [0.60, 0.61, 0.59, 2.0, 0.60]
     sampling.take([Reading(40.0 + k, v) for k, v in enumerate(values)])
     sample = sampling.look(45.0, 0.0)
@@ -182,7 +182,7 @@ def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
 
 @pytest.mark.parametrize("late_s", [1, 7])
 def test_samples_keep_their_beat_also_when_each_is_looked_at_late(late_s):
-    sampling = Sampling(PioreactorConfig(), 60.0, 0.0)
+    sampling = UnitSampling(PioreactorConfig(), 60.0, 0.0)
     seen = []
     for second in range(0, 3600, late_s):
         sampling.take([Reading(float(second - k), 0.5) for k in range(late_s - 1, -1, -2)])
@@ -254,7 +254,7 @@ def test_two_units_have_their_own_values(monkeypatch):
     said = {"timestamp": "t", "ods": {"1": {"od": 0.4}, "2": {"od": 9.0}}}
     box.take("pioreactor/pio02/turbidostat/od_reading/ods", json.dumps(said).encode(), False)
     (reading,), _, _ = box.drain()
-    sampling = Sampling(config.of("pio02"), 60.0, 0.0)
+    sampling = UnitSampling(config.of("pio02"), 60.0, 0.0)
     sampling.take([reading, reading])
     assert sampling.look(6.0, 0.0).od == pytest.approx(2.5 * 0.4)
     config = RigBackendConfig(units={"pio01": UnitConfig(address="http://10.0.0.1/")})
@@ -265,18 +265,18 @@ def test_two_units_have_their_own_values(monkeypatch):
 @pytest.mark.parametrize(("reading", "raw"), [(0.6, 6000.0), (-0.2, 0.0), (6.1, 60000.0), (0.00005, 0.5)])
 def test_the_interlock_s_counts_are_those_of_the_photodiode_not_of_the_od(reading, raw, calibrated):
     """Of a reading of a calibration they are unknown, and never those of a sensor that failed."""
-    sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
+    sampling = UnitSampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     sampling.take([Reading(at, reading, calibrated) for at in (1.0, 3.0)])
     assert sampling.look(4.0, 0.0).raw == pytest.approx(max(raw, RAW_MIN) if calibrated else raw)
 
 
 def test_readings_of_the_window_count_and_one_alone_is_no_sample():
     """12 s of window: at 30 s what came at 18 s and later; the first of a sample is not older than it."""
-    sampling = Sampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
+    sampling = UnitSampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
     sampling.take([Reading(17.9, 9.0)])
     sampling.take([Reading(18.0, 0.5)])
     assert sampling.look(29.9, 0.0).number == 2
-    sampling = Sampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
+    sampling = UnitSampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
     sampling.take([Reading(17.9, 9.0), Reading(18.0, 0.5)])
     assert sampling.look(30.0, 0.0) is None
     sampling.take([Reading(30.0, 0.7)])
