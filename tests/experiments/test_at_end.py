@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -16,36 +17,19 @@ from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 
-def ended(folder: Path, **each: str) -> Rehearsal:
-    """M0 has ten minutes to do, M1 seventy; both grow with 0.03 1/min."""
-    config = rehearsed(("M0", "M1"), Scenario((0.4,), (70.0,), (37.0,)))
-    run = Rehearsal(folder, replace(config, each={"M0": {"minutes": [10.0], **each}}), quiet(mu=0.03), od=0.4)
+def begun(folder: Path, total_min: float, *names: str, **own: Any) -> Rehearsal:
+    """Reactors that grow with 0.03 1/min, of which M0 may have a schedule and an end of its own."""
+    config = replace(rehearsed(names, Scenario((0.4,), (total_min,), (37.0,))), each={"M0": own})
+    run = Rehearsal(folder, config, quiet(mu=0.03), od=0.4)
     run.begin()
-    list(run.run())
-    assert run.loop.done.all()
     return run
 
 
 @pytest.mark.slow
-def test_it_goes_on_at_its_last_setpoint(tmp_path: Path) -> None:
-    run = ended(tmp_path)
-    assert run.truth("M0")["od"] == pytest.approx(0.4, abs=0.03)
-    assert run.truth("M1")["od"] == pytest.approx(0.4, abs=0.03)
-    assert abs(len(run.record.rows[0]) - len(run.record.rows[1])) <= 1
-    run.reactors.stop()
-    assert not any(run.truth("M0")["motors"].values())
-
-
-@pytest.mark.slow
-def test_it_stops_dosing(tmp_path: Path) -> None:
-    run = ended(tmp_path, at_end="stop")
-    assert run.truth("M0")["od"] > 1.5  # an hour of undiluted growth, 0.4 exp(1.8) if the medium lasts
-    assert len(run.record.rows[0]) == pytest.approx(11, abs=1)
-
-
-@pytest.mark.slow
 def test_it_is_handed_over_to_the_device_and_stays_so(tmp_path: Path) -> None:
-    run = ended(tmp_path, at_end="regulate")
+    run = begun(tmp_path, 70.0, "M0", "M1", minutes=[10.0], at_end="regulate")
+    list(run.run())
+    assert run.loop.done.all()
     assert run.reactors.handed_over.tolist() == [True, False]
     run.reactors.stop()
     run.wait(1800.0)
@@ -57,10 +41,7 @@ def test_it_is_handed_over_to_the_device_and_stays_so(tmp_path: Path) -> None:
 
 
 def test_it_is_not_handed_over_by_a_sensor_that_is_not_believed(tmp_path: Path) -> None:
-    config = rehearsed(("M0", "M1"), Scenario((0.4,), (12.0,), (37.0,)))
-    each = {"M0": {"minutes": [4.0], "at_end": "regulate"}}
-    run = Rehearsal(tmp_path, replace(config, each=each), quiet(mu=0.03), od=0.4)
-    run.begin()
+    run = begun(tmp_path, 12.0, "M0", "M1", minutes=[4.0], at_end="regulate")
     list(run.run(190.0))
     inject(run.device, "spectrometer_dead", "M0", 1)
     for _ in run.run(480.0):
@@ -72,9 +53,7 @@ def test_it_is_not_handed_over_by_a_sensor_that_is_not_believed(tmp_path: Path) 
 
 
 def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path) -> None:
-    config = replace(rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,))), at_end="regulate")
-    run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
-    run.begin()
+    run = begun(tmp_path, 5.0, "M0", at_end="regulate")
     list(run.run())
     assert run.reactors.handed_over.tolist() == [True]
 
@@ -83,15 +62,12 @@ def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path)
 def test_a_run_that_is_over_is_not_taken_to_the_device_again_once_its_pumps_were_verified_off(
     tmp_path: Path, stopped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,)))
-    run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
-    run.begin()
-    for _ in run.run():
-        pass
+    run = begun(tmp_path, 5.0, "M0")
+    list(run.run())
     if stopped:
         run.reactors.stop()
     run.close()
-    setup = assemble.unpack(replace(config, resume=str(tmp_path)), tmp_path)
+    setup = assemble.unpack(replace(run.config, resume=str(tmp_path)), tmp_path)
     record = Record(tmp_path, run.names, setup.fsync, setup.columns)
     tried = ConnectionError("the device was asked")
     monkeypatch.setattr(setup.family, "open", Mock(side_effect=tried))

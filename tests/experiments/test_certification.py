@@ -135,28 +135,6 @@ def test_a_line_knows_every_action_that_is_chosen_along_it_and_hardly_another(se
         np.testing.assert_array_equal(points.y[points.strip == n], setpoint)
 
 
-def test_the_limit_of_images_against_sets_of_points() -> None:
-    """Random overlapping pieces; the points of a fine grid under every action and both ends of its shift."""
-    rng = np.random.default_rng(3)
-    for _ in range(8):
-        edges = np.sort(rng.uniform(-1, 1, 6))
-        low = np.concatenate([[-2.0], edges - rng.uniform(0, 0.05, 6)])
-        high = np.concatenate([edges, [2.0]])
-        middle = np.linspace(0.2, -0.2, 7) + rng.uniform(-0.05, 0.05, 7)
-        middle[[0, -1]] = 0.2, -0.2
-        shift = np.stack([middle - 0.01, middle + 0.01], axis=1)
-        band = images(Pieces(low[None], high[None], np.arange(7)[None]), shift[None], np.array([[-1.5, 1.5]]))
-        grid = np.linspace(-1.5, 1.5, 15_001)
-        now = (-1.5, 1.5)
-        for _ in range(400):
-            x = grid[(grid >= now[0]) & (grid <= now[1])]
-            met = (x[:, None] >= low) & (x[:, None] <= high)
-            after = np.concatenate([(x[:, None] + shift[:, k])[met] for k in (0, 1)])
-            now = (after.min(), after.max())
-        assert band.invariant[0]
-        assert (band.low[0], band.high[0]) == pytest.approx(now, abs=6e-4)
-
-
 def test_a_map_that_leaves_its_start_has_no_band() -> None:
     whole = Pieces(np.array([[-9.0]]), np.array([[9.0]]), np.array([[0]]))
     band = images(whole, np.array([[[0.1, 0.1]]]), np.array([[-1.0, 1.0]]))

@@ -32,7 +32,6 @@ from tests.campaigns.killed_run import KillConfig, killed_run
 from tests.campaigns.rehearsal import SOUND, Rehearsal, rehearsed
 from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
-from tests.hardware.emulator_lab import quiet
 from tests.hardware.test_serial_transport import Cable, wired
 from tests.patience import PATIENCE_S
 
@@ -241,11 +240,4 @@ def test_a_share_that_was_counted_is_taken_over_once_also_over_a_kill(tmp_path: 
         if float(step.minute[0]) > 62.0:
             break
     assert np.isfinite(again.estimator.estimate().logit).all()
-    run.close()
-
-
-def test_a_sample_without_an_estimate_changes_nothing(tmp_path: Path) -> None:
-    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (20.0,), (37.0,))), quiet(mu=0.02), od=0.5)
-    run.begin()
-    assert run.loop.counted("M0", 0.3, 0.03, 1.0) == ("left out: nothing here estimates it", True)
     run.close()

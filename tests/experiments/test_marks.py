@@ -348,13 +348,6 @@ def test_a_mark_that_was_torn_is_not_there_and_comes_again(tmp_path: Path) -> No
         read_marks(tmp_path)
 
 
-def test_many_who_mark_at_once_leave_every_mark(tmp_path: Path) -> None:
-    marks = [Mark(float(k), "M0", f"mark {k}") for k in range(40)]
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda one: add_mark(tmp_path, one), marks))
-    assert sorted(read_marks(tmp_path), key=lambda m: m.time_min) == marks
-
-
 def test_whoever_marks_waits_for_another_one(tmp_path: Path) -> None:
     """Two files begun at once would have two headers."""
     held = os.open(tmp_path, os.O_RDONLY)

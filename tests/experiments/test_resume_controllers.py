@@ -1,6 +1,5 @@
 """A run that is stopped or killed and resumed: its controller decides what one that never stopped decides."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from experiments.laws.density import estimators
 from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
-from hardware import memory
-from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
@@ -114,24 +111,6 @@ def test_without_its_memory_it_decides_something_else(
     cold = cut_and_continued(kind, tmp_path, forgets=True)
     assert decisions(cold)[:CUT] == decisions(uninterrupted[kind])[:CUT]
     assert decisions(cold) != decisions(uninterrupted[kind])
-
-
-@pytest.mark.slow
-def test_a_program_that_is_stopped_takes_up_the_memory_that_it_wrote(tmp_path: Path) -> None:
-    """The policy that ships, with driver, interlock and record, on the emulated device."""
-    r = Rehearsal(tmp_path, rehearsed(("M0", "M1"), SCHEDULE), od=0.45, seed=5)
-    for until in (930.0, 1290.0):
-        r.begin()
-        steps = list(r.run(until))
-        r.reactors.stop()
-        r.close()
-        assert any(step.proposed.any() for step in steps)
-    kept = json.loads((tmp_path / "state.json").read_text())["controller"]
-    assert kept["estimator"]["learned"][0] > 12  # readings since the run began
-    r.begin()
-    assert isinstance(r.loop.density.law, Remembers)
-    assert json.loads(json.dumps(memory.save(r.loop.density.law))) == kept
-    r.close()
 
 
 class Counting:

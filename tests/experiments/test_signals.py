@@ -8,23 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.control import run
 from experiments.control.assemble import unpack
 from experiments.deploy import main
-from experiments.laws import registry
 from experiments.loop import signals
-from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
 from experiments.training import agents, tasks
 from hardware.actuator import THERMOSTAT
-from hardware.emulator.device import plant_preset
-from hardware.safety.interlock import Interlock, kinds_of
-from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.safety.interlock import kinds_of
 from tests.extensions import light
 
 HOLD = ("plant=coculture", "scenario=hold", "scenario.setpoints=[0.5]", "scenario.temperatures=[33.2]")
@@ -83,34 +77,6 @@ def test_the_columns_of_every_signal_follow_one_another(tmp_path: Path) -> None:
     assert setup.columns == (*USUAL, "light", "light_setpoint")
     shares = main.config(["plant=coculture", "scenario=ratio_steps", "composition=pi"])
     assert unpack(shares, tmp_path).columns == (*USUAL, *COLUMNS, "true_ratio")
-
-
-def loop(reactors: SimulatedReactors) -> ClosedLoop:
-    n = len(reactors.names)
-    held = signals.made("light", light.IntegralConfig(far=50.0), [SCHEDULE] * n)
-    law = registry.build(registry.config("inverse"), model=EnvConfig())
-    return ClosedLoop(reactors, law, Interlock(n), SCHEDULE, further=[held])
-
-
-def vials() -> SimulatedReactors:
-    return SimulatedReactors(
-        Plant(plant_preset("coculture"), 2, np.random.default_rng(3)), SimulatedConfig(reactors=("M0", "M1"))
-    )
-
-
-def test_a_resumed_run_decides_what_one_without_a_pause_decides() -> None:
-    def told(run: ClosedLoop, steps: int) -> list[Any]:
-        found = [run.step() for _ in range(steps)]
-        return [[s.columns["light"].tolist(), s.temperature.tolist(), s.rate.tolist(), s.reasons] for s in found]
-
-    expected = told(loop(vials()), 80)
-    reactors = vials()
-    first = loop(reactors)
-    begun = told(first, 35)
-    state = json.loads(json.dumps(first.state()))
-    second = loop(reactors)
-    second.restore(state)
-    assert begun + told(second, 45) == expected
 
 
 def test_names_and_actuators_are_used_once() -> None:
