@@ -23,6 +23,9 @@ from hardware.storage.recording_reader import read_recording
 
 F = TypeVar("F", bound=Callable[..., Any])
 WORDS = ("plant=coculture", "scenario=ratio_steps", "composition=proportional", "fsync=false")
+STEPS, TWO, OTHER = "scenario=ratio_steps", "plant=coculture scenario=ratio_steps", "give composition=midpoint"
+TRAINED = "composition=dqn_preview: its policy was trained for shares of 0.1 to 0.9, the scenario asks for"
+FAR = "+each.M1.ratios=[null,0.95,0.5,0.4]"
 PHASES = ("scenario.minutes=[20,150,180,30]", "backend.reactors=[M0,M1]", "+each.M1.ratios=[0.6,null,0.4,null]")
 
 
@@ -154,58 +157,39 @@ def test_a_scenario_alone_is_completed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        ("plant=coculture composition=pi", "composition=pi: no scenario asks for a share; give scenario=ratio_steps"),
+        (f"{STEPS} composition=pi plant=bench", "composition=pi: the vials hold one species .* give plant=coculture"),
         (
-            ("plant=coculture", "composition=pi"),
-            "composition=pi: no scenario asks for a share; give scenario=ratio_steps",
-        ),
-        (
-            ("scenario=ratio_steps", "composition=pi", "plant=bench"),
-            "composition=pi: the vials hold one species .* give plant=coculture",
-        ),
-        (
-            ("scenario=ratio_steps", "composition=pi", "backend=emulator", "backend.plant=bench"),
+            f"{STEPS} composition=pi backend=emulator backend.plant=bench",
             "composition=pi: the vials hold one species .* give backend.plant=coculture",
         ),
+        (f"{TWO} composition=dqn composition_policy=nowhere", "policy nowhere: no such file; give the policy.npz"),
         (
-            (*WORDS[:2], "composition=dqn", "composition_policy=nowhere"),
-            "policy nowhere: no such file; give the policy.npz",
-        ),
-        (
-            (*WORDS[:2], "composition=dqn", f"composition_policy={policies.SHIPPED}"),
+            f"{TWO} composition=dqn composition_policy={policies.SHIPPED}",
             r"policy = \['error', 'growth_share'\]: allowed one with observation \['logit_share'",
         ),
         (
-            (*WORDS[:2], "composition=optimum", "backend.reactors=[M0,M1]", "+each.M1.ratios=[0.6,0.5,0.4,0.3]"),
+            f"{TWO} composition=optimum backend.reactors=[M0,M1] +each.M1.ratios=[0.6,0.5,0.4,0.3]",
             "composition=optimum plans one program: give all reactors the same shares and minutes",
         ),
+        (f"{TWO} composition=dqn_preview scenario.ratios=[null,0.95,0.5,0.03]", f"{TRAINED} 0.03, 0.95; {OTHER}"),
+        (f"{TWO} composition=dqn_preview backend.reactors=[M0,M1] {FAR}", f"{TRAINED} 0.95; "),
         (
-            (*WORDS[:2], "composition=dqn_preview", "scenario.ratios=[null,0.95,0.5,0.03]"),
-            "composition=dqn_preview: its policy was trained for shares of 0.1 to 0.9, the scenario asks for 0.03, "
-            "0.95; give composition=midpoint",
-        ),
-        (
-            (*WORDS[:2], "composition=dqn_preview", "backend.reactors=[M0,M1]", "+each.M1.ratios=[null,0.95,0.5,0.4]"),
-            "composition=dqn_preview: its policy was trained for shares of 0.1 to 0.9, the scenario asks for 0.95; ",
-        ),
-        (
-            (*WORDS[:2], "composition=dqn_preview", "pair=ecoli_psyringae"),
+            f"{TWO} composition=dqn_preview pair=ecoli_psyringae",
             "policy's pair = of E. coli and P. putida, for a run with E. coli and P. syringae; growth differs by up to "
             "0.5. 1/h: allowed the run's own: train one with pair=",
         ),
-        ((*WORDS[:2], "pair=yeasts"), "pair = yeasts: allowed ecoli_pputida, ecoli_psyringae, a pair.yaml, or"),
+        (f"{TWO} pair=yeasts", "pair = yeasts: allowed ecoli_pputida, ecoli_psyringae, a pair.yaml, or"),
         (
-            (*WORDS[:2], "composition=pi", "safety.composition_high=31"),
+            f"{TWO} composition=pi safety.composition_high=31",
             "safety.composition_low to composition_high = 29 to 31 degC: allowed a range that holds 33.20 degC, where",
         ),
-        (
-            ("scenario=ratio_steps", "composition=pi", "+each.M0.ratios=[0.5]", "plant=coculture"),
-            "each.M0: scenario.ratios",
-        ),
+        (f"{TWO} composition=pi +each.M0.ratios=[0.5]", "each.M0: scenario.ratios"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_the_remedy(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused_with_the_remedy(words: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(frame.UserError, match=said) as caught:
-        deploy(tmp_path / "run", *words)
+        deploy(tmp_path / "run", *words.split())
     assert "\n" not in str(caught.value)
 
 

@@ -28,19 +28,8 @@ from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 pytestmark = pytest.mark.numeric
 
 NAN = float("nan")
-QUIET = CompositionEstimatorConfig(
-    growth_sd=0.0,
-    pigment_sd=0.0,
-    bias_walk=0.0,
-    dose_cv=0.0,
-    gain_sd=0.0,
-    factor_sd=0.0,
-    offset_sd=0.0,
-    factor_walk=0.0,
-    thermometer_sd=0.0,
-    production_first_sd=0.0,
-    starts=1,
-)
+SURE = ("growth_sd", "pigment_sd", "bias_walk", "dose_cv", "gain_sd", "factor_sd", "offset_sd", "factor_walk")
+QUIET = CompositionEstimatorConfig(**dict.fromkeys((*SURE, "thermometer_sd", "production_first_sd"), 0.0), starts=1)
 SMALL = replace(
     QUIET, share_sd=0.02, bias_sd=0.01, pigment_first_sd=0.02, production_first_sd=0.01, thermometer_sd=0.01
 )
@@ -57,10 +46,8 @@ def readings(theta, minutes):
     true = WARM + warmer
     share = 1.0 / (1.0 + np.exp(-logit))
     e, p = np.exp(log_od) * (1.0 - share), np.exp(log_od) * share
-    grow_e, grow_p = (
-        (1.0 + bias_e) * float(e_coli_rate(true)) / 60.0,
-        (1.0 + bias_p) * float(p_putida_rate(true)) / 60.0,
-    )
+    grow_e = (1.0 + bias_e) * float(e_coli_rate(true)) / 60.0
+    grow_p = (1.0 + bias_p) * float(p_putida_rate(true)) / 60.0
     per_minute = float(steady_production(true)) / 60.0
     f = np.exp(more) * float(steady_production(WARM)) * 0.5 * 0.5 / float(p_putida_rate(WARM))
     seen = [(e + p, QUIET.factor * (f + 150.0 * (e + p)) + QUIET.offset)]
@@ -156,10 +143,7 @@ def test_what_is_considered_never_moves_and_always_counts():
 
 def test_a_gap_is_as_many_minutes_without_readings():
     seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 60)
-    gap, nothing = (
-        CompositionEstimator(CompositionEstimatorConfig()),
-        CompositionEstimator(CompositionEstimatorConfig()),
-    )
+    gap, nothing = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(2))
     yes = np.array([True])
     for estimator in (gap, nothing):
         follow(estimator, seen[:30])

@@ -60,15 +60,9 @@ def inverse_policy(control_min: float = 1.0) -> policy.Policy:
     b0 = np.concatenate([rates - 0.01, 0.01 - rates]).astype(np.float32)
     w1 = -np.concatenate([np.eye(n), np.eye(n)]).astype(np.float32)
     metadata = {"format": 2, "observation": ["od", "setpoint"], "control_min": control_min, "regret_pct": 1.0}
+    one, none = np.eye(2, dtype=np.float32), np.zeros(2, np.float32)
     return policy.Policy(
-        (w0, w1),
-        (b0, np.zeros(n, np.float32)),
-        np.eye(2, dtype=np.float32),
-        np.zeros(2, np.float32),
-        rates,
-        np.full(2, -np.inf, np.float32),
-        np.full(2, np.inf, np.float32),
-        metadata,
+        (w0, w1), (b0, np.zeros(n, np.float32)), one, none, rates, none - np.inf, none + np.inf, metadata
     )
 
 
@@ -147,18 +141,23 @@ def test_bad_input_ends_in_one_line(word, parts, tmp_path):
     assert "Traceback" not in done.stderr
 
 
+class Tell:
+    """A hook that keeps what it is told."""
+
+    def __init__(self, told):
+        self.told = told
+
+    def __call__(self, event, text, reactor=""):
+        self.told.append((event, reactor, text))
+
+    def close(self):
+        self.told.append("closed")
+
+
 def test_a_run_says_which_reactor_was_stopped_and_what_each_of_them_was_given(tmp_path, monkeypatch, caplog):
     """M0 grows towards 1.2 for 20 min without a dose; M1 is held at 0.4, and given up once it has had 3 mL."""
     told = []
-
-    class Tell:
-        def __call__(self, event, text, reactor=""):
-            told.append((event, reactor, text))
-
-        def close(self):
-            told.append("closed")
-
-    monkeypatch.setattr(notify, "opened", lambda target, run, resumed: Tell())
+    monkeypatch.setattr(notify, "opened", lambda target, run, resumed: Tell(told))
     monkeypatch.setattr(control.charts, "save", lambda figure, folder, name: folder / name)  # takes most of the time
     monkeypatch.setattr(Curves, "end", lambda *given: told.append(("curves", given[1]["outcome"])))
     config = DeployConfig(
@@ -205,27 +204,19 @@ def test_a_run_says_which_reactor_was_stopped_and_what_each_of_them_was_given(tm
     ],
 )
 def test_how_a_run_ended_is_told_once_and_a_failure_ends_the_command(ends, told, raised, tmp_path, monkeypatch):
-    heard = []
-
-    class Tell:
-        def __call__(self, event, text, reactor=""):
-            heard.append((event, text))
-
-        def close(self):
-            heard.append("closed")
+    heard, asked = [], []
 
     def recorded(setup, folder, tell):
         if isinstance(ends, Exception):
             raise ends
         return ends
 
-    asked = []
-    monkeypatch.setattr(notify, "opened", lambda target, run, resumed: asked.append((target, run, resumed)) or Tell())
+    monkeypatch.setattr(notify, "opened", lambda *given, **more: asked.append((*given, *more.values())) or Tell(heard))
     monkeypatch.setattr(control, "_recorded", recorded)
     config = DeployConfig(controller=registry.config("pi"), notify="mail lab")
     with nullcontext() if raised is None else pytest.raises(raised[0], match=raised[1]):
         control.deploy(config, tmp_path)
-    assert heard == [("end", told), "closed"]
+    assert heard == [("end", "", told), "closed"]
     assert asked == [("mail lab", tmp_path, False)]
 
 

@@ -71,13 +71,8 @@ def test_a_sample_that_was_not_decided_on_becomes_a_row_without_a_dose(tmp_path:
                  ("sample", sample(3.0)))  # fmt: skip
     Record(tmp_path, ("M0",), fsync=False).close()
     last = rows(tmp_path)[-1]
-    assert [float(last[k]) for k in ("time_min", "elapsed_min", "od", "setpoint", "volume_ml")] == [
-        3.0,
-        2.0,
-        0.51,
-        0.4,
-        0.0,
-    ]
+    expected = {"time_min": 3.0, "elapsed_min": 2.0, "od": 0.51, "setpoint": 0.4, "volume_ml": 0.0}
+    assert {key: float(last[key]) for key in expected} == expected
     assert last["interlock"] == "the program ended before it decided"
     killed_after(tmp_path, ("sample", sample(9.0)), ("decision", decision(9.0)))
     Record(tmp_path, ("M0",), fsync=False).close()

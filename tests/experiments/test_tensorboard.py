@@ -38,21 +38,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "tensorboard.md"
 ROW = re.compile(r"^\| `(\w+/\w+)` \| (.*?) ?\|", re.MULTILINE)
 TEN = ["fsync=false", "scenario=hold", "scenario.setpoints=[0.45]", "scenario.minutes=[12]", "scenario.recovery_od=0.1"]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
+SLOW = ["controller=pi", "backend.reactors=[M0,M1]", "bench.period_s=120", "safety.ml_per_run=3"]
+SLOW += ["scenario.minutes=[20]", "plant.start_od=0.4", "scenario.recovery_od=0.44"]
 PAGES = ["Density", "Pump, heat, interlock"]  # of a deployment
 RUNS = {
     "learning": [*SHORT, "seed=3"],
     "population": [*SHORT, "n_agents=2"],
     "dqn": [*TEN, "backend.seed=5"],
-    "pi": [
-        *TEN,
-        "controller=pi",
-        "backend.reactors=[M0,M1]",
-        "bench.period_s=120",
-        "safety.ml_per_run=3",
-        "scenario.minutes=[20]",
-        "plant.start_od=0.4",
-        "scenario.recovery_od=0.44",
-    ],
+    "pi": [*TEN, *SLOW],
     "pi_tuned": [*TEN, "controller=pi_tuned"],
     "shares": [*TEN, "plant=coculture", "composition=dqn_preview", "scenario.ratios=[0.4]"],
 }

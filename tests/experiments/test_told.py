@@ -35,13 +35,8 @@ class Told:
         n = len(self._od)
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.log(self._od / self._setpoint) / 0.06 + self.off
-        estimates = {"error": error, "growth_share": np.full(n, 0.5)}
-        return {
-            "supervised": 1.0 - self._asked,
-            **estimates,
-            "error_sd": np.full(n, 0.1),
-            "growth_share_sd": np.full(n, 0.1),
-        }
+        estimates = {"error": error, "growth_share": np.full(n, 0.5), "supervised": 1.0 - self._asked}
+        return estimates | dict.fromkeys(("error_sd", "growth_share_sd"), np.full(n, 0.1))
 
 
 @pytest.mark.parametrize("flow", [1.0, 0.5])

@@ -30,15 +30,8 @@ from experiments.training.config import TrainConfig
 from experiments.training.density import DensityTask, first_actions
 from tests.patience import PATIENCE_S
 
-SHORT = [
-    "agent.total_steps=500",
-    "agent.learn_start=100",
-    "agent.epsilon_steps=400",
-    "eval_every=200",
-    "checkpoint_every=200",
-    "n_agents=2",
-    "seed=2",
-]
+SHORT = ["agent.total_steps=500", "agent.learn_start=100", "agent.epsilon_steps=400", "eval_every=200"]
+SHORT += ["checkpoint_every=200", "n_agents=2", "seed=2"]
 KILL_SEED = int(os.environ.get("KILL_SEED", "0"))
 ROOT = Path(__file__).parents[2]
 pytestmark = [pytest.mark.xdist_group("train"), pytest.mark.numeric]  # its tests share a run, made once
