@@ -24,6 +24,8 @@ from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.numeric
 
+PI, TWO = "studies.c.compositions=[pi]", "studies.c.plants=[coculture]"
+STEPS = "studies.c.scenarios=[ratio_steps]"
 SHORT = (
     "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
     "scenarios.ratio_steps.minutes=[30,60,60,60]",
@@ -312,19 +314,13 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        (["studies.composition.compositions=[pid]"], "studies.composition.compositions: pid is none of"),
-        (
-            ["studies.c.compositions=[pi]", "studies.c.plants=[nominal]", "studies.c.scenarios=[ratio_steps]"],
-            "studies.c.plants = nominal: allowed those with two species",
-        ),
-        (
-            ["studies.c.compositions=[pi]", "studies.c.plants=[coculture]", "studies.c.scenarios=[day]"],
-            "studies.c.scenarios = day: allowed those with ratios",
-        ),
-        (["+experiment=comparison", "studies.c.compositions=[pi]"], "all with compositions, or none"),
-        (["composition_policies.pi=x.npz"], "composition_policies = pi: allowed dqn, dqn_preview"),
+        ("studies.composition.compositions=[pid]", "studies.composition.compositions: pid is none of"),
+        (f"{PI} studies.c.plants=[nominal] {STEPS}", "studies.c.plants = nominal: allowed those with two species"),
+        (f"{PI} {TWO} studies.c.scenarios=[day]", "studies.c.scenarios = day: allowed those with ratios"),
+        (f"+experiment=comparison {PI}", "all with compositions, or none"),
+        ("composition_policies.pi=x.npz", "composition_policies = pi: allowed dqn, dqn_preview"),
     ],
 )
 def test_wrong_words_end_in_one_line(overrides, says):
     with pytest.raises(frame.UserError, match=says):
-        load(*overrides)
+        load(*overrides.split())

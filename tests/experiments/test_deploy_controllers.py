@@ -14,6 +14,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -143,33 +144,13 @@ def test_the_paper_s_rival_on_an_emulated_device_behind_a_real_socket(tmp_path: 
     check(tmp_path, "mpc")
 
 
-def test_a_stop_before_the_pumps_were_looked_at_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.mark.parametrize(("kind", "first"), [(EmulatorFamily, "linked"), (PioreactorFamily, "units")])
+def test_a_stop_before_the_pumps_were_looked_at_says_so(kind: Any, first: str, tmp_path: Path, monkeypatch, caplog):
     """Ctrl-C at the first request, by which the device is found: what an earlier life left on may run on."""
-
-    @contextmanager
-    def stopped(_: EmulatorFamily, backend: EmulatorConfig, bench: Bench) -> Iterator[None]:
-        raise KeyboardInterrupt
-        yield
-
-    monkeypatch.setattr(EmulatorFamily, "linked", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        run.deploy(config("inverse", "emulator", tmp_path), tmp_path)
-    assert "pumps not verified off" in caplog.text
-
-
-def test_a_stop_before_the_units_were_looked_at_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    @contextmanager
-    def stopped(*_given: object) -> Iterator[None]:
-        raise KeyboardInterrupt
-        yield
-
-    monkeypatch.setattr(PioreactorFamily, "units", stopped)
+    monkeypatch.setattr(kind, first, Mock(side_effect=KeyboardInterrupt))
+    backend = EmulatorConfig() if kind is EmulatorFamily else PioreactorConfig()
     with closing(Journal(tmp_path / "journal.jsonl", fsync=False)) as journal:
-        opening = Opening(PioreactorConfig(), Bench(), PlantConfig(), journal, tmp_path, resumed=False)
-        with pytest.raises(KeyboardInterrupt), PioreactorFamily().open(opening):
+        opening = Opening(backend, Bench(), PlantConfig(), journal, tmp_path, resumed=False)
+        with pytest.raises(KeyboardInterrupt), kind().open(opening):
             pass
     assert "pumps not verified off" in caplog.text

@@ -102,6 +102,7 @@ def test_page_is_well_formed_and_points_to_nothing_outside(text):
     assert "://" not in text
     assert "@import" not in text
     assert set(re.findall(r"url\((.)", text)) <= {"#"}
+    assert "`" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)  # Markdown's
 
 
 @pytest.mark.slow
@@ -202,12 +203,6 @@ def test_in_short_a_law_without_rival_stands_beside_the_oracle_and_the_noise(ora
     said = f"ISE 0.17 ± 0.02 OD² min ({ise}noise 0.001), ITAE 12.6 ± 2 OD min² ({itae}noise 4.9)"
     assert f"<li>dqn, s on p: {said}</li>" in text
     assert "Lowest" not in text
-
-
-@pytest.mark.slow
-def test_no_markup_of_another_kind_is_left_on_a_page(text):
-    """Backticks are Markdown's, and stood as characters around the names of laws and plants."""
-    assert "`" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
 
 
 def test_numbers_that_a_verdict_has_told_are_folded_without_empty_rows_and_typeset_as_it(tmp_path):

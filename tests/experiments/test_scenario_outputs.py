@@ -1,6 +1,7 @@
 """What a step gives by a spare pump: how much, by whom, never twice, never two pumps at one time."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -32,7 +33,7 @@ from tests.hardware.emulator_lab import BIAS_S, quiet
 
 STEPS = Scenario((0.4, 0.4), (60.0, 20.0), (37.0, 37.0), outputs=("pump3 3 mL/h, pump4 1.5 mL", None))
 FEEDS = ("Pump1", "Pump3", "Pump4")
-ONE = np.array([True])
+Dose = tuple[float, int, int, float]
 
 
 def test_outputs_are_read() -> None:
@@ -44,14 +45,19 @@ def test_outputs_are_read() -> None:
         Scenario(outputs=("LEDD 0.3",))
 
 
-def given(supply: Supply, minutes: range, phase: int = 0) -> list[tuple[float, int, float]]:
+def each(supply: Supply, minutes: range, step: Callable[[int], Any], rows: Callable[[int], Any]) -> list[Dose]:
+    """Doses of all reactors (minute, reactor, pump, mL) by the step of each and whether its reading is believed."""
     found = []
     for minute in minutes:
-        pump, ml = supply.due(np.array([float(minute)]), np.array([phase]), ONE)
+        believed = np.array(rows(minute))
+        pump, ml = supply.due(np.full(believed.size, float(minute)), np.array(step(minute)), believed)
         supply.given(pump, ml)
-        if ml[0] > 0.0:
-            found.append((float(minute), int(pump[0]), round(float(ml[0]), 6)))
+        found += [(float(minute), int(n), int(pump[n]), round(float(ml[n]), 6)) for n in np.flatnonzero(ml)]
     return found
+
+
+def given(supply: Supply, minutes: range, phase: int = 0) -> list[tuple[float, int, float]]:
+    return [(minute, pump, ml) for minute, _, pump, ml in each(supply, minutes, lambda _: [phase], lambda _: [True])]
 
 
 def test_a_rate_becomes_doses_of_half_a_millilitre_and_a_volume_equal_parts() -> None:
@@ -83,26 +89,15 @@ def test_minutes_without_a_believed_reading_are_made_up_for_in_that_reactor_alon
     """6 mL/h owe 0.1 mL a minute and 3 mL/h half of it; of both only the second's readings fail, at minutes 2 to 4."""
     hourly = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 6 mL/h",))
     supply = Supply([hourly, replace(hourly, outputs=("pump4 3 mL/h",))], 1.2)
-    doses: list[list[tuple[int, int, float]]] = [[], []]
-    for minute in range(13):
-        rows = np.array([True, not 2 <= minute <= 4])
-        pump, ml = supply.due(np.full(2, float(minute)), np.zeros(2, dtype=np.intp), rows)
-        for n in np.flatnonzero(ml):
-            doses[n].append((minute, int(pump[n]), round(float(ml[n]), 6)))
-        supply.given(pump, ml)
-    assert doses == [[(5, 3, 0.5), (10, 3, 0.5)], [(10, 4, 0.5)]]
+    doses = each(supply, range(13), lambda _: [0, 0], lambda minute: [True, not 2 <= minute <= 4])
+    assert doses == [(5, 0, 3, 0.5), (10, 0, 3, 0.5), (10, 1, 4, 0.5)]
 
 
 def test_a_volume_is_given_at_the_first_believed_reading_of_its_step() -> None:
     """The step begins at minute 3, in the second reactor with two readings that are not believed."""
     steps = Scenario((0.4, 0.4), (3.0, 60.0), (37.0, 37.0), outputs=("pump3 6 mL/h", "pump4 1 mL"))
     supply = Supply([steps, steps], 1.2)
-    doses = []
-    for minute in range(8):
-        rows = np.array([True, minute not in (3, 4)])
-        pump, ml = supply.due(np.full(2, float(minute)), np.full(2, int(minute >= 3)), rows)
-        supply.given(pump, ml)
-        doses += [(minute, int(n), int(pump[n]), float(ml[n])) for n in np.flatnonzero(ml)]
+    doses = each(supply, range(8), lambda minute: [int(minute >= 3)] * 2, lambda minute: [True, minute not in (3, 4)])
     assert doses == [(3, 0, 4, 1.0), (5, 1, 4, 1.0)]
 
 
@@ -110,11 +105,8 @@ def test_reactors_in_different_steps_are_given_what_each_one_s_step_says() -> No
     """At one moment the first is in its second step, the other still in its first, by another pump and rate."""
     first = Scenario((0.4, 0.4), (5.0, 60.0), (37.0,) * 2, outputs=("pump3 6 mL/h", "pump4 12 mL/h"))
     second = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 3 mL/h",))
-    supply, doses = Supply([first, second], 1.2), []
-    for minute in range(21):
-        pump, ml = supply.due(np.full(2, float(minute)), np.array([int(minute >= 5), 0]), np.ones(2, dtype=bool))
-        supply.given(pump, ml)
-        doses += [(minute, int(n), int(pump[n]), round(float(ml[n]), 6)) for n in np.flatnonzero(ml)]
+    supply = Supply([first, second], 1.2)
+    doses = each(supply, range(21), lambda minute: [int(minute >= 5), 0], lambda _: [True, True])
     hers = [(8, 0, 4, 0.6), (11, 0, 4, 0.6), (14, 0, 4, 0.6), (17, 0, 4, 0.6), (20, 0, 4, 0.6)]  # 0.2 mL a minute
     assert sorted(doses) == sorted([*hers, (10, 1, 3, 0.5), (20, 1, 3, 0.5)])
 
@@ -140,8 +132,8 @@ def config(schedule: Scenario = STEPS, **flows: float) -> Any:
     return replace(made, backend=replace(made.backend, supply=supply))
 
 
-def whole(folder: Path, schedule: Scenario = STEPS) -> Rehearsal:
-    run = Rehearsal(folder, config(schedule), quiet(mu=0.03), od=0.4)
+def whole(folder: Path, schedule: Scenario = STEPS, mu: float = 0.03, **flows: float) -> Rehearsal:
+    run = Rehearsal(folder, config(schedule, **flows), quiet(mu=mu), od=0.4)
     run.begin()
     list(run.run())
     return run
@@ -184,9 +176,7 @@ def test_on_the_device_both_pumps_give_what_the_step_says_and_it_counts(tmp_path
 def test_a_dose_by_a_spare_pump_dilutes_as_much_as_one_by_the_feed(tmp_path: Path) -> None:
     """Without growth 3 mL into 20 mL at the tube: od exp(-3 / 20), in three doses that run 0.1 s longer."""
     schedule = Scenario((1.0,), (15.0,), (37.0,), outputs=("pump3 3 mL",))
-    run = Rehearsal(tmp_path, config(schedule), quiet(mu=0.0), od=0.4)
-    run.begin()
-    list(run.run())
+    run = whole(tmp_path, schedule, 0.0)
     assert run.truth("M0")["od"] == pytest.approx(0.4 * np.exp(-3.3 / 20.0), rel=0.02)
 
 
@@ -290,11 +280,7 @@ def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path)
 
 
 def test_the_declared_bias_is_taken_off_a_dose(tmp_path: Path) -> None:
-    made = config(Scenario((1.0,), (8.0,), (37.0,), outputs=("pump3 2 mL",)))
-    supply = SupplyConfig(pump3_ml_s=1.0, bias_s=BIAS_S)
-    run = Rehearsal(tmp_path, replace(made, backend=replace(made.backend, supply=supply)), quiet(), od=0.4)
-    run.begin()
-    list(run.run())
+    run = whole(tmp_path, Scenario((1.0,), (8.0,), (37.0,), outputs=("pump3 2 mL",)), bias_s=BIAS_S)
     assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.01)
 
 

@@ -75,12 +75,15 @@ def test_only_a_policy_that_was_trained_to_the_end_and_is_good_is_sent_to_a_proo
     assert any("experiments.certify" in line for line in caplog.messages) == sent
 
 
-def test_a_policy_is_scored_by_the_first_episode_that_ends_behind_each_multiple(tmp_path: Path) -> None:
-    """Episodes of 24 steps, an evaluation every 50, and one at the end; updates begin at step 40."""
+def test_a_policy_is_scored_and_saved_behind_each_multiple(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Episodes of 24 steps, an evaluation every 50, a checkpoint every 100, and both at the end; updates from 40 on."""
     env, agent = EnvConfig(episode_steps=24), replace(SMALL, total_steps=340)
     one = session(tmp_path / "run", env=env, agent=agent, eval_every=50, checkpoint_every=100)
+    save, written = checkpoint.save, []
+    monkeypatch.setattr(checkpoint, "save", lambda *given: (written.append(one.agents.steps), save(*given)))
     one.run()
     one.writer.close()
+    assert written == [120, 216, 312, 340]
     assert [step for step, *_ in one.best.history] == [72, 120, 168, 216, 264, 312, 340]
     assert len(one.returns) == len([*range(24, 340, 24), 340])
     saved = checkpoint.load(tmp_path / "run" / "checkpoint.pt")
@@ -728,21 +731,6 @@ def test_the_table_of_runs_has_of_each_seed_its_own_numbers() -> None:
     assert ["limit", "0.5", "0.003"] in rows
     assert rows[-2:] == [["seed 8", "0.400", "0.0020"], ["seed 9", "7.000", "0.0500"]]
     assert step == 90
-
-
-def test_a_checkpoint_is_written_behind_each_multiple_and_at_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Episodes of 24 steps, none of which ends at a multiple of 50 but the last."""
-    one = session(
-        tmp_path / "run", env=EnvConfig(episode_steps=24), agent=replace(SMALL, total_steps=220, learn_start=200),
-        eval_every=1000, checkpoint_every=50,
-    )  # fmt: skip
-    written: list[int] = []
-    monkeypatch.setattr(checkpoint, "save", lambda path, state: written.append(one.agents.steps))
-    one.run()
-    one.writer.close()
-    assert written == [72, 120, 168, 216, 220]
 
 
 def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_resumed_one_keeps_them(
