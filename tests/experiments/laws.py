@@ -90,15 +90,13 @@ def share_law(
     order: int = 1,
     offset: float = 0.0,
     levels: int = 1,
-    sharp: float = 1e6,
 ) -> Policy:
     """The one-line law of (error, growth share), exactly: argmax_a 2 z v_a - v_a^2 with z = gain e + share s + offset.
 
     Hidden units +-z, relu(-50 - 50 (e + s)) and a bump 2e-6 wide in s, far from any grid: relu(1 - 1e6 |s - SPIKE|
     - 30 |e + 0.5|). add: (unit, action, weight) adds a unit to an action's Q. levels: every so-manyth level is chosen.
-    sharp: in place of 1e6, at which single precision itself is unsure of the bump's height.
     """
-    k = sharp
+    k = 1e6
     w1 = np.array([[gain, -gain, -50, 0, 0, 30, -30], [share, -share, -50, k, -k, 0, 0]])
     b1 = np.array([0, 0, -25, -k * SPIKE, k * SPIKE, 15, -15])
     w2 = np.zeros((7, 4))

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +9,19 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from experiments.cli import frame
 from experiments.comparison import figures, page, studies
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
 from experiments.reporting import charts
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Emphasis
+from tests.experiments.test_benchmark import load
 
 FLOOR_RED = "#b00020"
 STEPS = (
     "+experiment=setpoint_steps", "studies.setpoint_steps.plants=[upset_pump,bench]",
     "studies.setpoint_steps.controllers=[mpc,pi,dqn]", "replicates=2",
 )  # fmt: skip
-
-
-@cache
-def load(*overrides: str) -> BenchmarkConfig:
-    cfg = frame.compose("benchmark", overrides)
-    return frame.load(cfg, BenchmarkConfig())
 
 
 def trial(config: BenchmarkConfig, cell: Cell, number: int) -> DensityTrial:

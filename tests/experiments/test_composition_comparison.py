@@ -20,6 +20,7 @@ from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, ru
 from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.loop.loop import ClosedLoop
+from tests.experiments.test_benchmark import load
 from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.numeric
@@ -30,11 +31,6 @@ SHORT = (
     "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
     "scenarios.ratio_steps.minutes=[30,60,60,60]",
 )  # fmt: skip
-
-
-def load(*overrides: str) -> BenchmarkConfig:
-    cfg = frame.compose("benchmark", overrides)
-    return frame.load(cfg, BenchmarkConfig())
 
 
 @cache

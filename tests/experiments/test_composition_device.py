@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,12 @@ from experiments.control.run import BenchMarks
 from experiments.laws import registry
 from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
-from hardware.chibio.calibrations import save_calibration
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
 from tests.campaigns.audit import audit_doses, audit_rows
-from tests.campaigns.killed_run import KillConfig, killed_run
-from tests.campaigns.rehearsal import SOUND, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
 from tests.hardware.test_serial_transport import Cable, wired
@@ -156,27 +154,6 @@ def test_a_sample_that_was_not_decided_on_keeps_its_light(tmp_path: Path) -> Non
     assert float(row["fluorescence"]) == samples[-1]["fluorescence"] > 100.0
     assert row["interlock"] == "the program ended before it decided"
     assert row["ratio"] == ""
-
-
-@pytest.mark.slow
-def test_processes_killed_and_resumed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    words = ("scenario.ratios=[0.3]", "scenario.temperatures=[33.2]", "composition=proportional")
-    pace = {"speed": 15.0, "longest_s": 8.0, "answer_s": 4.0}  # a sample stands 4 s before the next one replaces it
-    config = KillConfig(kills=3, runs=1, workers=1, reactors=("M0", "M1"), overrides=words, plant="coculture", **pace)
-    for name in config.reactors:
-        for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
-            save_calibration(tmp_path / "calibration", name, part, asdict(pump))
-    found = killed_run(config, 3, tmp_path / "run0", 0)
-    assert found.ok, found
-    assert found.lives == 4
-    assert found.rows >= found.samples > 0
-    light, ratio = column(tmp_path / "run0", "fluorescence"), column(tmp_path / "run0", "ratio")
-    assert np.isfinite(light).all()
-    assert (light > 100.0).all()
-    assert np.isfinite(ratio[1:]).mean() > 0.8  # but for rows that were completed from a sample alone
-    state = json.loads((tmp_path / "run0" / "state.json").read_text())
-    assert state["composition"]["controller"]["estimator"]
 
 
 @pytest.fixture

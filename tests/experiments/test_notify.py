@@ -10,19 +10,13 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import notify
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Hook, Notifier, hidden
-from experiments.record.summary import ChangeLog
-from hardware.emulator.faults import inject
 from tests import programs
-from tests.campaigns.rehearsal import Rehearsal, rehearsed
-from tests.hardware.emulator_lab import quiet
 from tests.patience import PATIENCE_S
 
 SECRET = "T0SECRET"
@@ -100,42 +94,6 @@ def test_a_run_that_fails_says_so_by_a_command_of_the_environment(tmp_path: Path
     (line,) = map(json.loads, told.read_text().splitlines())
     assert line["event"] == "end"
     assert line["text"].startswith("failed: ")
-
-
-def rehearsal(folder: Path, tell: Notifier | None = None) -> Rehearsal:
-    """Half an hour at 0.4 in which the spectrometer fails for a while."""
-    folder.mkdir()
-    run = Rehearsal(folder, rehearsed(("M0",), Scenario((0.4,), (30.0,), (37.0,))), quiet(mu=0.03), od=0.4)
-    run.begin()
-    changes = ChangeLog(run.loop, tell)
-    for step in run.run():
-        changes(step)
-        minute = float(step.minute[0])
-        inject(run.device, "spectrometer_dead", "M0", int(10.0 < minute < 14.0))
-    return run
-
-
-@pytest.mark.slow
-def test_a_hook_that_hangs_changes_no_sample_and_no_dose(tmp_path: Path) -> None:
-    plain = rehearsal(tmp_path / "plain")
-    server = Server(hangs=True)
-    tell = Notifier(Hook(server.url, limit_s=15.0), tmp_path)
-    told = rehearsal(tmp_path / "told", tell)
-    assert server.asked.wait(10.0)  # it has been asked, and has not answered
-    assert (tell.sent, tell.failed) == (0, 0)  # nobody waited for it: not even one try has ended
-    for column in plain.record.columns:
-        if column != "interlock":
-            np.testing.assert_array_equal(told.record.series(column), plain.record.series(column))
-    assert [(d.pump, d.start_s, d.seconds) for d in told.device.vials["M0"].doses] == [
-        (d.pump, d.start_s, d.seconds) for d in plain.device.vials["M0"].doses
-    ]
-    server.released.set()
-    tell.close()
-    assert [line["event"] for line in server.lines][:2] == ["alarm", "alarm"]
-    assert server.lines[0]["text"].startswith("spectrometer: ")
-    assert server.lines[0]["reactor"] == "M0"
-    server.shutdown()
-    server.server_close()
 
 
 def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]

@@ -62,23 +62,13 @@ def test_a_wrong_address_is_one_line_and_speaks_of_no_pumps(tmp_path: Path, comm
 def test_a_service_manager_that_ends_a_blank_leaves_its_pumps_off(tmp_path: Path) -> None:
     """By SIGTERM, and by a second one at once."""
     with EmulatorProcess(["--speed", "20", "--od", "0", "--unblanked"]) as device:
-        words = (
-            f"backend.url={device.url}",
-            "backend.speed=20",
-            "hydra.run.dir=run",
-            f"backend.calibration={tmp_path}/c",
-        )
+        words = [f"backend.url={device.url}", "backend.speed=20", f"backend.calibration={tmp_path}/c"]
+        words.append("hydra.run.dir=run")
         client = Program("experiments.blank", *words, cwd=tmp_path, out=tmp_path / "out")
         client.until(lambda: "waiting for" in client.said())
-        with (
-            urllib.request.urlopen(
-                urllib.request.Request(f"{device.url}/SetOutputTarget/Pump1/M0/0.05", method="POST"), timeout=10.0
-            ),
-            urllib.request.urlopen(
-                urllib.request.Request(f"{device.url}/SetOutputOn/Pump1/1/M0", method="POST"), timeout=10.0
-            ),
-        ):  # somebody else's hand
-            pass
+        for path in ("SetOutputTarget/Pump1/M0/0.05", "SetOutputOn/Pump1/1/M0"):  # by somebody else's hand
+            request = urllib.request.Request(f"{device.url}/{path}", method="POST")
+            urllib.request.urlopen(request, timeout=10.0).close()
         client.terminate()
         time.sleep(0.02)
         client.terminate()

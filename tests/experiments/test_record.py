@@ -249,6 +249,8 @@ def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own
         "M1: interlock: all well again",
         f"M0: drained 5 s {again}",
     ]
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warned == ["M1: stale: as before", "M1: interlock: all well again"]
     assert told == [
         ("hand_over", "the supervisor's law acts, the estimate is in doubt, from minute 2", "M1"),
         ("hand_over", "the policy acts again from minute 3", "M1"),

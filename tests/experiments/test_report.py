@@ -349,17 +349,6 @@ def test_on_a_phone_no_page_scrolls_sideways_and_no_cell_is_a_column_of_letters(
     assert min(width for length, width in sizes if length > 8) > 60
 
 
-def test_tables_of_several_runs_are_files_of_their_own(tmp_path):
-    for name in ("2_deploy", "3_deploy"):
-        run_folder(tmp_path / "demo" / name, {"windows": [{"reactor": name}], "marks": [{"text": name}]})
-    report.write(tmp_path / "demo")
-    assert {path.name: path.read_text().split() for path in (tmp_path / "demo/tables").glob("*.csv")} == {
-        f"{run}_{table}.csv": [column, run]
-        for run in ("2_deploy", "3_deploy")
-        for table, column in (("windows", "reactor"), ("marks", "text"))
-    }
-
-
 @pytest.mark.parametrize(
     ("env", "unit"),
     [("density", "OD"), ("relative", "periods of full pump"), ("coculture", "of the share")],
@@ -403,10 +392,10 @@ def test_every_number_of_a_run_has_its_own_unit(tmp_path):
     }.items()  # fmt: skip
 
 
-def test_each_run_of_a_folder_has_its_own_seed_command_and_figures(tmp_path):
+def test_each_run_of_a_folder_has_its_own_seed_command_figures_and_tables(tmp_path):
     """Two runs of one command are called by their folders, and each figure stands in the section of its run."""
     for k, name in enumerate(("1_train", "2_train")):
-        run = run_folder(tmp_path / "both" / name, {"value": k})
+        run = run_folder(tmp_path / "both" / name, {"windows": [{"reactor": name}], "marks": [{"text": name}]})
         (run / "config.yaml").write_text(f"env:\n  seed: 99\nseed: {40 + k}\n")
         (run / ".hydra").mkdir()
         (run / ".hydra" / "overrides.yaml").write_text(f"- env.mu=0.0{k + 2}\n")
@@ -420,6 +409,11 @@ def test_each_run_of_a_folder_has_its_own_seed_command_and_figures(tmp_path):
         assert (ran["seed"], ran["overrides"], ran["run folder"]) == (
             str(40 + k), f"env.mu=0.0{k + 2}", f"{k + 1}_train",
         )  # fmt: skip
+    assert {path.name: path.read_text().split() for path in (tmp_path / "both/tables").glob("*.csv")} == {
+        f"{k}_train_{table}.csv": [column, f"{k}_train"]
+        for k in (1, 2)
+        for table, column in (("windows", "reactor"), ("marks", "text"))
+    }
 
 
 def test_a_table_for_a_paper_has_its_units_in_symbols():

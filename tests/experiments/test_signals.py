@@ -1,6 +1,5 @@
 """A signal of one's own from one file outside the program: recorded, warned of, summed up, saved, resumed, refused."""
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -19,17 +18,13 @@ from experiments.record.recovery import COLUMNS as USUAL
 from experiments.training import agents, tasks
 from hardware.actuator import THERMOSTAT
 from hardware.safety.interlock import kinds_of
+from tests.experiments.test_composition_deploy import rows
 from tests.extensions import light
 
 HOLD = ("plant=coculture", "scenario=hold", "scenario.setpoints=[0.5]", "scenario.temperatures=[33.2]")
 WORDS = (*HOLD, "scenario.recovery_od=0", "scenario.minutes=[300]", "fsync=false")
 LIGHT = ("signals.light.kind=integral", "signals.light.setpoint=1400")
 SCHEDULE = Scenario((0.5,), (80.0,), (33.2,))
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    with open(folder / "recordings" / "M0.csv", newline="", encoding="utf-8") as f:
-        return list(csv.DictReader(f))
 
 
 @pytest.mark.slow

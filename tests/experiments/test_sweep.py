@@ -122,16 +122,11 @@ def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, mo
 
 
 def test_jobs_are_those_that_hydra_makes_of_the_command_line():
-    words = frame.normalise(
-        ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"], "train"
-    )
-    assert sweep.jobs(words) == [
+    given = ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"]
+    assert sweep.jobs(frame.normalise(given, "train")) == [
         [f"agent={agent}", f"++seed={seed}", "++env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
     ]
     assert sweep.jobs(["hparams_search=tuned"]) is None
-
-
-def test_a_launcher_that_does_not_exist_is_one_line(tmp_path):
     with pytest.raises(UserError, match=r"^hydra/launcher=ray: no such option; allowed: basic, joblib"):
         frame.normalise(["-m", "hydra/launcher=ray"], "train")
 
@@ -298,6 +293,8 @@ def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothi
     assert sweep.asked(["+hparams_search=null", "seed=1"], "train") is None
     (tmp_path / "a" / "sweep.json").write_text("{")
     assert sweep.read(tmp_path / "a") is None
+    with pytest.raises(UserError, match="no sweep; a single run goes on without -m"):
+        sweep.asked(["-m", f"resume={tmp_path}"], "train")
 
 
 def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
@@ -318,11 +315,6 @@ def test_a_cluster_without_accounting_is_said_once_by_the_log_alone(caplog, monk
     (said,) = caplog.records
     assert said.name == frame.log.name
     assert "sacct" in said.getMessage()
-
-
-def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
-    with pytest.raises(UserError, match="no sweep; a single run goes on without -m"):
-        sweep.asked(["-m", f"resume={tmp_path}"], "train")
 
 
 def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):

@@ -33,6 +33,7 @@ from tests.hardware.pioreactor_lab import ALT_PIN, Lab
 
 HOUR = Scenario((0.45,), (60.0,), (37.0,))
 SOON = StressConfig(growth=0.012, gain=0.03, most=0.007, memory=3.0)
+UNIT, FOURTH = PioreactorConfig(reactors=("M0",)), replace(SOON, pump="pump 4")
 
 
 def drugged(**changes: Any) -> Any:
@@ -226,15 +227,9 @@ def test_a_signal_without_a_part_is_refused() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (
-            {"backend": PioreactorConfig(reactors=("M0",))},
-            "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube",
-        ),
-        (
-            {"backend": PioreactorConfig(reactors=("M0",)), "signals": {"drug": replace(SOON, pump="pump 4")}},
-            "drug acts by the pump 4: these reactors have feed pump",
-        ),
-        ({"signals": {"drug": replace(SOON, pump="pump 4")}}, "signals.drug of M0: Pump4 has no tube"),
+        ({"backend": UNIT}, "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube"),
+        ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug acts by the pump 4: these reactors have feed pump"),
+        ({"signals": {"drug": FOURTH}}, "signals.drug of M0: Pump4 has no tube"),
         ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* beside signals.drug"),
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),
     ],
