@@ -35,9 +35,7 @@ def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("words", "gain"), [((), 14 / 24), (("plant.vessel.volume_ml=18",), 18 / 24)])
-def test_a_calibrated_model_is_that_of_laws_and_of_the_simulated_vials(
-    words: tuple[str, ...], gain: float, tmp_path: Path
-) -> None:
+def test_a_calibrated_model_is_that_of_laws_and_of_the_simulated_vials(words, gain, tmp_path):
     """tau = V / (60 g), so that g = V / 24 with tau = 0.4; the laws have the bench's period and the slower cap."""
     (tmp_path / "calibrated.yaml").write_text("mu: 0.021\ntau: 0.4\nmax_pump_rate: 0.018\n")
     bench = "bench.volume_ml=14", "bench.period_s=120", "bench.max_rate=0.015", "plant=nominal_noise", "controller=mpc"

@@ -175,9 +175,7 @@ def test_duties_may_reach_both_ends_of_what_their_pump_takes() -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_each_vial_s_blank_is_stored_under_its_own_name_and_unit(
-    fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_each_vial_s_blank_is_stored_under_its_own_name_and_unit(fails, tmp_path, monkeypatch, caplog):
     """Of M2 and M5; where the counts do not come, everything is switched off and nothing stored."""
     ended: list[str] = []
 

@@ -243,9 +243,7 @@ def test_a_wrong_override_is_one_line(overrides, parts):
 
 
 @pytest.mark.slow
-def test_a_benchmark_of_one_seed_gives_one_summary_however_many_processes_run_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_benchmark_of_one_seed_gives_one_summary_however_many_processes_run_it(tmp_path, monkeypatch):
     policies.save(tmp_path / "policy.npz", inverse_policy())
     asked = load("+experiment=setpoint_steps", f"policies.dqn={tmp_path / 'policy.npz'}", "replicates=3",
                  "studies.setpoint_steps.controllers=[dqn,pi]")  # fmt: skip
@@ -286,9 +284,7 @@ def test_the_calibration_is_of_the_config_s_own_model_and_control_period() -> No
         assert value in drawing.caption
 
 
-def test_the_learning_curve_is_told_with_the_regret_of_the_policy_that_controls(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_learning_curve_is_told_with_the_regret_of_the_policy_that_controls(tmp_path, monkeypatch):
     """That policy is best on the selection grid, another seed on the reported one."""
     asked = []
 

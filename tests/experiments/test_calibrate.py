@@ -140,9 +140,7 @@ def test_a_real_recording(cli: Cli, summary_of: Summary, tmp_path: Path) -> None
     assert [np.hypot(floor, od * share) for od in (0.4, 0.1)] == pytest.approx([0.0127, 0.0057], rel=0.1)
 
 
-def test_a_recording_that_cannot_be_used_is_one_line_with_its_name(
-    plain: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def test_a_recording_that_cannot_be_used_is_one_line_with_its_name(plain, tmp_path, recording):
     """One that is not there, one that the reader refuses, one that the fit refuses."""
     time, od, pump_rate = recording
     tidy(tmp_path / "counts.csv", 13000 * 10**-od, time, pump_rate)
@@ -164,9 +162,7 @@ def of_two_pumps(path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray
     return f"data={path}"
 
 
-def test_a_refusal_of_the_fit_carries_what_the_reader_noted(
-    plain: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def test_a_refusal_of_the_fit_carries_what_the_reader_noted(plain, tmp_path, recording):
     data = of_two_pumps(tmp_path / "third.csv", recording, 0.0)
     with pytest.raises(frame.UserError, match=r"pump 3 .*pumps=\[3\]") as caught:
         plain(data)
@@ -174,9 +170,7 @@ def test_a_refusal_of_the_fit_carries_what_the_reader_noted(
     plain(data, "pumps=[3]", "pump_ml_s=1")
 
 
-def test_a_second_feed_is_told_in_the_first_line_and_on_the_page(
-    plain: Cli, summary_of: Summary, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def test_a_second_feed_is_told_in_the_first_line_and_on_the_page(plain, summary_of, tmp_path, recording):
     """Pumps 1 and 3 share the feed, 7 to 3: with one of them alone tau is wrong by 30 %."""
     data = of_two_pumps(tmp_path / "shared.csv", recording, 0.7)
     first = next(line for line in plain(data).splitlines() if line.startswith("use"))
@@ -239,9 +233,7 @@ def test_rows_too_far_apart_for_the_segments_are_told_as_that(plain: Cli, summar
     assert content["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
-def test_flaws_are_excluded_and_reported(
-    plain: Cli, summary_of: Summary, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def test_flaws_are_excluded_and_reported(plain, summary_of, tmp_path, recording):
     time, od, pump_rate = (a.copy() for a in recording)
     od[[30, 31]], od[60], od[90] = np.nan, -0.5, 3.0 * od[90]
     time[120], time[150] = time[119], time[140] + 0.5
@@ -253,9 +245,7 @@ def test_flaws_are_excluded_and_reported(
     assert content["tau"]["value"] == pytest.approx(0.31, rel=0.02)
 
 
-def test_a_study_of_intervals_counts_its_recordings_and_draws_them(
-    cli: Cli, summary_of: Summary, tmp_path: Path
-) -> None:
+def test_a_study_of_intervals_counts_its_recordings_and_draws_them(cli, summary_of, tmp_path):
     cli("coverage=3", "protocol.hours=2.5")
     content = summary_of()
     assert (content["recordings"], content["refused"]) == (3, 0)
@@ -388,9 +378,7 @@ def test_beside_the_pair_stands_that_of_the_other_method(method: str, fitted: Ca
 
 
 @pytest.mark.parametrize("rest_min", [10.0, 0.0])
-def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_start_of_every_hour(
-    rest_min: float,
-) -> None:
+def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_start_of_every_hour(rest_min):
     """u = 0.01 + 0.05 (x - r) between 0 and 0.02; three setpoints in three hours."""
     protocol = OpenLoop(start_od=0.5, hours=3.0, noise=0.02, control_min=1.0)
     config = CalibrateConfig(
@@ -403,9 +391,7 @@ def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_
     assert not np.allclose(rate[0], rate[1])
 
 
-def test_a_generated_recording_is_as_long_as_asked_and_says_what_it_is_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_generated_recording_is_as_long_as_asked_and_says_what_it_is_of(tmp_path, capsys):
     protocol = OpenLoop(mu=0.021, tau=0.41, hours=2.0, control_min=2.0)
     config = CalibrateConfig(generate=True, law="threshold", setpoints=(0.4,), protocol=protocol)
     assert command.body(config, tmp_path) is None
@@ -421,9 +407,7 @@ def test_a_generated_recording_is_as_long_as_asked_and_says_what_it_is_of(
 @pytest.mark.parametrize(
     ("rows", "given"), [(None, (0, None)), ("40:", (40, None)), (":700", (0, 700)), ("5:9", (5, 9)), (":", (0, None))]
 )
-def test_what_is_read_of_a_file_is_what_was_asked_for(
-    rows: str | None, given: tuple[int, int | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_read_of_a_file_is_what_was_asked_for(rows, given, tmp_path, monkeypatch):
     asked: dict[str, object] = {}
 
     def read(path: str, **words: object) -> None:
@@ -480,9 +464,7 @@ def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segme
     ]  # fmt: skip
 
 
-def test_a_study_returns_the_worse_share_of_both_and_says_each(
-    fitted: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_returns_the_worse_share_of_both_and_says_each(fitted, tmp_path, monkeypatch, capsys):
     """Four recordings, one refused; mu is held by one of three intervals and tau by two."""
     protocol = OpenLoop(tau=0.4, hours=5.0, noise=0.02, seed=4)
     growth = np.array([0.02, 0.0175, 1.0, 0.024])

@@ -210,9 +210,7 @@ def test_points_count_by_their_own_band_and_by_how_far_cultures_differ() -> None
     np.testing.assert_allclose(found.off, (value - mean[1] - slope * (t - mean[0])) / sd, rtol=1e-6)
 
 
-def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_own_lag_asks_for(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_own_lag_asks_for(caplog):
     """Four lags of 60 min and an hour behind them; 30.2 and 30.4 degC are one temperature."""
     few = [at(30.2, 0.5), at(30.4, 0.5), at(33.0, 0.6)]
     for lag, minutes in ((60.0, 300), (2.0, 180)):
@@ -245,9 +243,7 @@ def test_a_recording_whose_temperatures_cannot_be_is_named(cells: list[str], sai
         _plateaus((str(path),), 2.0, CalibratePairConfig())
 
 
-def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(tmp_path, capsys):
     """0.06 T - 1.1 and -0.01 T^2 + 0.6 T - 8.1: at 27 degC 0.52 and 0.81 1/h, at 35 degC 1.0 and 0.65."""
     points = [[at(27.0, 0.52), at(35.0, 1.0, 0.02)], [at(28.0, 0.86, 0.03, 4100.0)]]
     found = [curves.Polynomial((1.0,), np.array([0.25, -1.5])), curves.Polynomial((1.0,), np.array([2.0]))]
@@ -266,9 +262,7 @@ def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(
     assert lines[7] == f"files {tmp_path}/pair.yaml, {tmp_path}/figures/pair.png"
 
 
-def test_a_pair_holds_where_both_were_recorded_and_says_by_what(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pair_holds_where_both_were_recorded_and_says_by_what(tmp_path, monkeypatch, capsys):
     """Points on both true curves, the second's over less than the first's; to a tenth of a degree within both."""
     linear, parabola = np.poly1d([0.06, -1.1]), np.poly1d([-0.01, 0.6, -8.1])
     first = [at(t, float(linear(t))) for t in (27.43, 30.0, 33.0, 35.08)]

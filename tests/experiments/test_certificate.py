@@ -89,9 +89,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("made", "why"), REFUSED.values(), ids=list(REFUSED))
-def test_a_device_refuses_what_is_not_proven_and_says_how_to_prove_it(
-    tmp_path: Path, made: dict[str, Any], why: str
-) -> None:
+def test_a_device_refuses_what_is_not_proven_and_says_how_to_prove_it(tmp_path, made, why):
     source = written(tmp_path / "policy.npz", **made)
     said = refused(source, tmp_path / "run")
     assert re.search(why, said)
@@ -116,9 +114,7 @@ def test_a_device_refuses_a_policy_that_is_proven_for_another_pump(factor: float
 
 
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])
-def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_performance(
-    share: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_performance(share, tmp_path, monkeypatch):
     """Each requirement alone is written down as failed. Its number and limit are told, whatever follows."""
     given = laws.share_law() if share else laws.law()
     attacked_too = replace(ASKED, trajectories=600, quick=True, growth_shares=(0.3, 0.33))
@@ -153,9 +149,7 @@ def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_perfo
     assert set(kinds.values()) == {SAFETY, PERFORMANCE}
 
 
-def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_path, caplog):
     """In 12 mL a culture at rest needs mu tau / u_max = 0.3 of the pump; this policy gives 0.5 at the setpoint.
 
     In 28 mL and growing by 0.0432 1/min it needs more than the pump has.
@@ -199,9 +193,7 @@ def unpacked(path: Path, folder: Path, **changes: Any) -> assemble.Setup:
     return assemble.unpack(config, folder)
 
 
-def test_a_policy_without_certificate_is_refused_on_a_device_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_policy_without_certificate_is_refused_on_a_device_alone(tmp_path, caplog):
     source = tmp_path / "policy.npz"
     policy.save(source, laws.law())
     with pytest.raises(
@@ -250,9 +242,7 @@ PARTS: dict[str, tuple[policy.Policy, policy.Policy]] = {
 
 
 @pytest.mark.parametrize(("own", "other"), PARTS.values(), ids=list(PARTS))
-def test_a_device_names_the_part_of_a_policy_that_is_another(
-    tmp_path: Path, own: policy.Policy, other: policy.Policy, request: pytest.FixtureRequest
-) -> None:
+def test_a_device_names_the_part_of_a_policy_that_is_another(tmp_path, own, other, request):
     part = request.node.callspec.id
     source = written(tmp_path / "policy.npz", other, of=own)
     with pytest.raises(
@@ -286,9 +276,7 @@ CHANGED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "named"), CHANGED.values(), ids=list(CHANGED))
-def test_a_setting_of_the_estimator_is_another_policy(
-    relative: Path, tmp_path: Path, changes: dict[str, Any], named: str
-) -> None:
+def test_a_setting_of_the_estimator_is_another_policy(relative, tmp_path, changes, named):
     """On the command line or in the policy file, whose network is the same.
 
     What was not certified gets no bounds: surprises alone supervise it where it is forced.
@@ -353,9 +341,7 @@ def test_a_program_with_another_supervisor_is_another_policy(
         unpacked(relative, tmp_path / "run")
 
 
-def test_the_second_filter_is_part_of_what_is_certified(
-    relative: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_second_filter_is_part_of_what_is_certified(relative, tmp_path, monkeypatch):
     """The file's own settings are the old ones, so the first filter is the certified one."""
     given = policy.load(relative)
     own = replace(given, metadata={**given.metadata, "estimator": asdict(EstimatorConfig())})
@@ -374,9 +360,7 @@ def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
     }
 
 
-def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(
-    relative: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(relative, tmp_path, caplog):
     """Full pump takes 0.05 * 5 / (20/60) = 0.75 off ln x instead of 0.06, which is no reason by itself.
 
     Asked are that B alone, errors, spread doses, slow errors and watched errors at the run's two setpoints, and the two
@@ -466,9 +450,7 @@ def test_a_policy_that_is_not_safe_ends_the_command_with_one_line_and_its_certif
     assert (stored.safe, stored.passed) == (False, False)
 
 
-def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_says_what(
-    undrawn: None, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_says_what(undrawn, tmp_path, caplog):
     certified(laws.law(), tmp_path, "limits.entry=1", "limits.excess=0.0001")
     stored = certificate.load(tmp_path / "certificate.json")
     assert (stored.safe, stored.passed) == (True, False)
@@ -634,9 +616,7 @@ def test_whatever_is_asked_less_of_is_named_alone_and_what_is_asked_more_of_is_n
         assert named[0].startswith(f"limits.{f.name} = {own}, ")
 
 
-def test_a_certificate_that_asks_for_less_is_refused_if_less_of_safety_and_told_if_less_of_performance(
-    tmp_path: Path,
-) -> None:
+def test_a_certificate_that_asks_for_less_is_refused_if_less_of_safety_and_told_if_less_of_performance(tmp_path):
     limits = replace(Limits(), safe_excess=1.0, entry=2.0)
     for k, (config, less) in enumerate(((replace(ASKED, noise=0.0, limits=limits), True),
                                         (replace(ASKED, limits=Limits(entry=2.0)), False))):  # fmt: skip
@@ -693,9 +673,7 @@ def test_bounds_that_cannot_be_are_damage(relative: Path, tmp_path: Path, change
 
 @pytest.mark.parametrize("backend", [ChiBioConfig(), SimulatedConfig()])
 @pytest.mark.parametrize(("key", "value"), [("gate", 7), ("gate_sigma", -7.0)])
-def test_a_setting_of_an_estimator_that_cannot_be_is_one_line(
-    relative: Path, tmp_path: Path, backend: Any, key: str, value: float
-) -> None:
+def test_a_setting_of_an_estimator_that_cannot_be_is_one_line(relative, tmp_path, backend, key, value):
     with pytest.raises(UserError, match=rf"controller\.estimator\.{key}"):
         unpacked(relative, tmp_path / "run", backend=backend, controller=LearnedConfig(estimator={key: value}))
 
@@ -766,9 +744,7 @@ def test_a_policy_is_proven_on_the_model_that_was_calibrated(tmp_path: Path, mon
     assert [config.env_file for config in asked] == [None] * 3
 
 
-def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(monkeypatch):
     monkeypatch.setattr(command, "_row", lambda loop, proof: proof.case)
     proofs = [SimpleNamespace(case=k, holdable=np.array(held)) for k, held in enumerate(([1, 1], [0, 0], [0, 1]))]
     content = {name: name.upper() for name in ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks")}

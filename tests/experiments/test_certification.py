@@ -205,9 +205,7 @@ def test_the_physics_of_a_way_by_hand() -> None:
     [(0.0280086, 0.3097234), (0.031, 0.28)],
     ids=["growth is close to a level", "growth is between two levels"],
 )
-def test_entry_is_the_time_of_the_slowest_simulated_culture_into_what_is_allowed(
-    mu: float, tau: float, r: float
-) -> None:
+def test_entry_is_the_time_of_the_slowest_simulated_culture_into_what_is_allowed(mu, tau, r):
     """Periods until |x - r| is at most the law's half-width and 0.012 OD, and stays so, over those of the pump alone.
 
     With 0.0280086 * 0.3097234 / 0.02 * 16 = 6.94 levels of growth, level 7 takes off 0.0002 a period. The band itself

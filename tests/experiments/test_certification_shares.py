@@ -227,9 +227,7 @@ def test_many_periods_at_once_through_pieces_at_random() -> None:
     x=st.floats(0.01, 10.0),
     side=st.sampled_from([-1.0, 1.0]),
 )
-def test_the_farthest_estimate_is_as_far_as_its_own_bound(
-    b: float, r: float, error: float, od: float, x: float, side: float
-) -> None:
+def test_the_farthest_estimate_is_as_far_as_its_own_bound(b, r, error, od, x, side):
     """|e - estimate| = max(error, ln(1 + od / y) / B) at the OD y = r exp(B estimate) that is estimated.
 
     Any farther one is too far, any nearer one is not. Below, an OD of less than the error of the OD has no farthest.
@@ -462,9 +460,7 @@ WORSE: dict[str, tuple[Policy, float, tuple[float, float]]] = {
 
 
 @pytest.mark.parametrize(("policy", "excess", "where"), WORSE.values(), ids=list(WORSE))
-def test_a_policy_that_is_a_little_worse_than_the_law_fails_by_how_much_it_is(
-    policy: Policy, excess: float, where: tuple[float, float]
-) -> None:
+def test_a_policy_that_is_a_little_worse_than_the_law_fails_by_how_much_it_is(policy, excess, where):
     """Exact estimates: e' = s - v of the law is within 1/32.
 
     An offset of 0.04 is where e rests. Of even levels the nearest is within 1/16. With a gain of 1.5, e' = -e / 2

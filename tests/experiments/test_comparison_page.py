@@ -228,9 +228,7 @@ def share_entry(scenario: str, plant: str, law: str, k: float) -> dict[str, Any]
     return {"signal": "share", "scenario": scenario, "plant": plant, "controller": law, "n": 3, **errors, **rest}
 
 
-def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate_covers_and_the_density(
-    tmp_path: Path,
-) -> None:
+def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate_covers_and_the_density(tmp_path):
     """Laws down, plants across; one law did not run on the second plant; no reading is of a last day."""
     rows = [share_entry("steps", "one", "pi", 1.0), share_entry("steps", "one", "midpoint", 2.0)]
     rows += [share_entry("steps", "two", "midpoint", 3.0), share_entry("sine", "one", "pi", 4.0)]

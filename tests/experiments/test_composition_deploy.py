@@ -193,9 +193,7 @@ def test_what_does_not_fit_is_refused_with_the_remedy(words: str, said: str, tmp
     assert "\n" not in str(caught.value)
 
 
-def test_a_learned_controller_without_a_policy_that_ships_says_what_to_give(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_learned_controller_without_a_policy_that_ships_says_what_to_give(tmp_path, monkeypatch):
     monkeypatch.setitem(policies.SHIPPED_COMPOSITION, "dqn", tmp_path / "none.npz")
     with pytest.raises(frame.UserError, match="composition=dqn: no policy for it comes with this version; give compos"):
         deploy(tmp_path / "run", *WORDS[:2], "composition=dqn")

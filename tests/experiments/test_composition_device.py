@@ -116,9 +116,7 @@ def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
     run.close()
 
 
-def test_what_the_device_dosed_while_the_program_was_dead_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_device_dosed_while_the_program_was_dead_is_told(tmp_path, monkeypatch):
     """A pump left on repeats its dose; the estimate's dilution is the interlock's account of it."""
     monkeypatch.setattr(assemble, "_share", lambda config, plant, folder, scenarios: share(scenarios))
     run = rehearsal(tmp_path, SHORT)

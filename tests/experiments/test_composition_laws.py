@@ -313,13 +313,8 @@ def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_i
     )  # fmt: skip
     asked_for = Wanted(np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.2, 0.5]), np.array([90.0, 400.0, 0.0]))
     target = found.act(one, asked_for, np.zeros(3), np.array([True, True, False]))
-    np.testing.assert_allclose(
-        shown[0],
-        [
-            [0.3, 30.5, 0.7 + 0.05 * e_coli_rate(EQUAL_RATES_C), logit(0.4), logit(0.7), 90.0],
-            [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0],
-        ],
-    )
+    first = [0.3, 30.5, 0.7 + 0.05 * e_coli_rate(EQUAL_RATES_C), logit(0.4), logit(0.7), 90.0]
+    np.testing.assert_allclose(shown[0], [first, [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0]])
     np.testing.assert_allclose(target, [34.75, 31.5, EQUAL_RATES_C])
 
 

@@ -93,9 +93,7 @@ def warned(composition: Share, minute: float, believed: bool = True) -> list[str
 
 
 @pytest.mark.parametrize(("answer", "target"), [(31.5, 31.5), (12.0, 29.0), (80.0, 36.0), (np.nan, 33.2)])
-def test_a_target_goes_through_the_limits_and_one_that_is_no_number_leaves_the_schedules(
-    answer: float, target: float
-) -> None:
+def test_a_target_goes_through_the_limits_and_one_that_is_no_number_leaves_the_schedules(answer, target):
     composed = step(held(Scripted(target=answer), [HOLD]), 5.0)
     assert composed.target == composed.columns["temperature_target_degc"] == target
     assert tuple(composed.columns) == COLUMNS
@@ -112,9 +110,7 @@ def test_the_limits_are_the_interlocks_and_a_target_at_one_of_them_may_be_stuck(
 @pytest.mark.parametrize(
     ("schedule", "elapsed"), [(replace(HOLD, ratios=()), 5.0), (replace(HOLD, ratios=(None,)), 5.0), (HOLD, np.nan)]
 )
-def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goes_on_watching(
-    schedule: Scenario, elapsed: float
-) -> None:
+def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goes_on_watching(schedule, elapsed):
     """Neither where the schedule asks for none nor before it begins."""
     keeper = Scripted(target=30.0)
     composed = step(held(keeper, [schedule]), 5.0, elapsed=elapsed)

@@ -131,9 +131,7 @@ def test_a_plan_is_in_the_rates_of_the_pump_that_is_there() -> None:
     np.testing.assert_allclose(plan["predicted_od"][1], 0.5, rtol=1e-4)
 
 
-def test_a_decision_begins_at_the_last_plan_a_period_on_and_of_each_reactor_at_its_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_decision_begins_at_the_last_plan_a_period_on_and_of_each_reactor_at_its_own(monkeypatch):
     """The last move stands twice. The second reactor has no reading once, and keeps its plan for the next time."""
     plans = [np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), np.array([[0.7, 0.8, 0.9]]), np.zeros((2, 3))]
     starts: list[list[list[float]]] = []

@@ -169,9 +169,7 @@ def test_what_the_run_would_refuse_is_refused() -> None:
 
 
 @pytest.mark.parametrize("swept", [False, True])
-def test_what_has_no_timetable_is_refused_and_does_not_run(
-    swept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_has_no_timetable_is_refused_and_does_not_run(swept, tmp_path, monkeypatch):
     """A job of a sweep comes here with its folder; it doses nothing."""
     monkeypatch.setattr(frame, "swept", lambda: swept)
     config = main.config(["dry_run=true", "controller=pi", "scenario.minutes=[2,2,2]"])

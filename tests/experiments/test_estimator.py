@@ -178,9 +178,7 @@ def test_its_doubt_is_that_of_many_vials_drawn_from_its_beliefs() -> None:
 
 
 @pytest.mark.parametrize(("gain", "period"), [(1.0, 1.0), (0.7, 1.0), (0.7, 2.0), (1.4, 5.0)])
-def test_its_doubt_of_a_pump_that_is_not_sound_is_the_scatter_of_vials_as_it_believes_them(
-    gain: float, period: float
-) -> None:
+def test_its_doubt_of_a_pump_that_is_not_sound_is_the_scatter_of_vials_as_it_believes_them(gain, period):
     """e = ln(x/r)/B and s = mu h/B with B = g u_max h/tau. Too small a doubt of a worn pump keeps a supervisor away."""
     e, r = Estimator(BARE, replace(MODEL, control_min=period)), np.full(1, 0.4)
     e.reset(1)

@@ -157,9 +157,7 @@ def test_every_phase_without_a_temperature_gets_that_at_which_both_species_grow_
         ({"composition_low": 25.0, "composition_high": 34.0}, (25.0, 34.0)),
     ],
 )  # fmt: skip
-def test_the_thermostat_s_limits_are_those_of_the_pair_at_each_end_that_nobody_sets(
-    given: dict[str, float], limits: tuple[float, float], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_thermostat_s_limits_are_those_of_the_pair_at_each_end_that_nobody_sets(given, limits, caplog):
     """29 and 36 degC are what is left as it is."""
     config = replace(TWO, **SHARES, pair="ecoli_psyringae", safety=SafetyConfig(**given))
     with caplog.at_level("INFO"):
@@ -205,9 +203,7 @@ def test_a_device_is_told_to_measure_light_only_where_a_share_is_held(tmp_path: 
     assert [signal.name for signal in lit.further] == ["fluorescence"]
 
 
-def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_that_were_chosen(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_that_were_chosen(caplog):
     plain = replace(TWO, backend=EmulatorConfig(reactors=("M0", "M1")), scenario=STEPS, pair="ecoli_psyringae")
     with caplog.at_level("INFO"):
         whole = assemble.completed(plain)

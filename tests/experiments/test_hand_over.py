@@ -103,9 +103,7 @@ def posted(run: Losable) -> list[str]:
 
 
 @pytest.mark.parametrize("sound", [True, False])
-def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(
-    tmp_path: Path, sound: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_path, sound, monkeypatch, caplog):
     run = handed_over(tmp_path)
     run.sound = sound
     paths = posted(run)
@@ -138,9 +136,7 @@ def test_a_resumed_run_hands_over_again_what_lost_its_regulation_meanwhile(tmp_p
 
 
 @pytest.mark.slow
-def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_again(tmp_path, monkeypatch):
     run = handed_over(tmp_path)
     run.device.handle("POST", "/SetOutputOn/OD/0/M0")
     whole = run.device.submit

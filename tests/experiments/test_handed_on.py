@@ -74,9 +74,7 @@ def test_curves_beyond_what_a_training_allows_are_taken_to_its_ends(tmp_path: Pa
     assert (env.scale_e, env.scale_p) == (SCALES[1], SCALES[0])
 
 
-def test_files_of_the_environment_and_of_the_command_line_are_both_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_the_environment_and_of_the_command_line_are_both_loaded(tmp_path, monkeypatch):
     """Each once, first those that are known; a worker is told of all of them."""
     paths = [tmp_path / f"added_{name}_for_a_test.py" for name in ("first", "second", "third")]
     for path in paths:
@@ -95,9 +93,7 @@ def test_files_of_the_environment_and_of_the_command_line_are_both_loaded(
     assert os.environ[extensions.VARIABLE].split(os.pathsep) == [str(path) for path in paths]
 
 
-def test_latest_is_the_file_that_was_written_last_or_its_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_latest_is_the_file_that_was_written_last_or_its_folder(tmp_path, monkeypatch):
     """Whatever the folders are called; of `resume` and `runs` the folder, of the command itself."""
     monkeypatch.chdir(tmp_path)
     written = [
@@ -159,13 +155,9 @@ def test_a_value_is_shown_as_it_is_typed(value: Any, text: str) -> None:
 def test_what_a_disk_answers_is_told_with_its_remedy_however_it_is_wrapped() -> None:
     """Of a full disk another than of a folder that is somebody else's; what is none of both is shown whole."""
     free, place = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
-    full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    for number, remedy in (
-        *((n, free) for n in full),
-        (errno.EACCES, place),
-        (errno.EROFS, place),
-        (errno.EEXIST, place),
-    ):
+    remedies = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), free)
+    remedies |= dict.fromkeys((errno.EACCES, errno.EROFS, errno.EEXIST), place)
+    for number, remedy in remedies.items():
         error = OSError(number, os.strerror(number), "run/a.csv")
         said = f"run/a.csv: {os.strerror(number)}; {remedy}"
         assert frame._refusal(error) == said
@@ -200,8 +192,6 @@ def test_what_a_run_leaves_is_named_with_the_command_that_goes_on(tmp_path: Path
         (["turbidostat", "train", "resume=x"], False), (["python", "-m", "experiments.train", "resume=deploy"], False),
     ],
 )  # fmt: skip
-def test_a_stop_before_anything_began_says_whether_a_pump_may_run(
-    words: list[str], pumps: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_before_anything_began_says_whether_a_pump_may_run(words, pumps, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", words)
     assert start.stopped() == "stopped before anything began" + "; pumps not verified off: resume the run" * pumps

@@ -50,9 +50,7 @@ def test_a_run_that_is_under_way_is_left_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["deleted", "moved"])
-def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_its_end(
-    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_its_end(tmp_path, how, caplog):
     run = in_a_dose(tmp_path, "M0")
     (path,) = (tmp_path / "recordings").glob("*.csv")
     assert caplog.text == ""
@@ -68,9 +66,7 @@ def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_i
     run.close()
 
 
-def test_an_exception_in_a_dose_ends_the_run_with_its_pumps_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exception_in_a_dose_ends_the_run_with_its_pumps_off(tmp_path, monkeypatch):
     def steps() -> None:
         raise RuntimeError("a bug")
 
@@ -92,9 +88,7 @@ def said(caplog: pytest.LogCaptureFixture, notes: list[tuple[float, str]]) -> li
     return [note for _, note in notes if note in caplog.text]
 
 
-def test_a_note_of_one_reactor_silences_no_other_and_what_has_doubled_is_told_again(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_note_of_one_reactor_silences_no_other_and_what_has_doubled_is_told_again(caplog):
     same = "a dose of 1.05 mL was repeated up to {} times by the device"
     notes = [(0.0, f"M0: {same.format(1)}"), (1.0, f"M1: {same.format(1)}"), (2.0, f"M2: {same.format(1)}")]
     notes += [(60.0, f"M0: {same.format(9)}"), (61.0, "M0: pumps on: Pump1"), (62.0, "M0: pumps on: Pump3")]

@@ -197,9 +197,7 @@ def test_a_bottle_that_was_filled_is_dosed_from_at_once_and_counted_from_then_al
     made.close()
 
 
-def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(tmp_path, caplog):
     """Of a reactor that is not in the run it stands in the journal alone; what is doubtful is a warning."""
     told: list[tuple[Any, ...]] = []
     journal = SimpleNamespace(rows=[], append=lambda kind, fields: told.append((kind, fields)))
@@ -307,9 +305,7 @@ def test_a_run_that_was_stopped_and_resumed_is_under_way_again(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("text", ["foam (2 mL)", "pH=7", "a, b", "it's in", "'quoted already'"])
-def test_a_note_is_taken_as_it_was_typed(
-    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_note_is_taken_as_it_was_typed(text, tmp_path, monkeypatch, capsys):
     """The command leaves a mark and no folder of its own."""
     monkeypatch.chdir(tmp_path)
     folder = _under_way(tmp_path / "run")
@@ -372,9 +368,7 @@ def test_whoever_marks_waits_for_another_one(tmp_path: Path) -> None:
         ({"run": "simulated"}, "run=simulated: not under way; give minute="),
     ],
 )
-def test_what_is_wrong_is_named(
-    config: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_wrong_is_named(config, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     _under_way(tmp_path / "run")
     _under_way(tmp_path / "simulated", "sim")

@@ -127,9 +127,7 @@ class Counting:
         pass
 
 
-def test_every_message_comes_in_order_and_what_was_not_taken_is_counted_and_said_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_message_comes_in_order_and_what_was_not_taken_is_counted_and_said_once(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     hook = Counting()
     tell = Notifier(hook, tmp_path)  # type: ignore[arg-type]

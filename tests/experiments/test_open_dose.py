@@ -113,9 +113,7 @@ def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobod
 
 @pytest.mark.slow
 @pytest.mark.parametrize("decides", [False, True])
-def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_dies(
-    tmp_path: Path, decides: bool
-) -> None:
+def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_dies(tmp_path, decides):
     """Again before its first sample, or when it has decided with the repeats booked and not yet saved that it has."""
     run = Cut(tmp_path, FEED_ON)
     run.wait(500.0)
@@ -137,9 +135,7 @@ def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_die
 
 @pytest.mark.parametrize("how", ["worker_wipe", "power_cut"])
 @pytest.mark.parametrize("after_s", [3.0, 271.0])
-def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_knows_when(
-    tmp_path: Path, how: str, after_s: float
-) -> None:
+def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_knows_when(tmp_path, how, after_s):
     run = Cut(tmp_path, FEED_ON)
     run.wait(after_s)
     inject(run.device, how)
@@ -161,9 +157,7 @@ def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_kno
 @pytest.mark.parametrize(
     ("request_", "note", "waste_times"), [(FEED_OFF, "", [14]), (TARGET, NONE, []), (WASTE_ON, NONE, [14])]
 )
-def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(
-    tmp_path: Path, request_: str, note: str, waste_times: list[int]
-) -> None:
+def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(tmp_path, request_, note, waste_times):
     """In the waste tail, or before the feed pump was started."""
     run = Cut(tmp_path, request_)
     run.wait(900.0)
@@ -176,9 +170,7 @@ def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(
 
 
 @pytest.mark.parametrize(("request_", "fed"), [(FEED_ON, True), (WASTE_ON, False), (TARGET, False)])
-def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(
-    tmp_path: Path, request_: str, fed: bool
-) -> None:
+def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(tmp_path, request_, fed):
     run = Cut(tmp_path, request_, stops=True)
     end = run.journal("dose_end")[-1]
     true = [d for d in run.device.vials["M0"].doses if d.pump == "Pump1" and d.start_s > run.died_s - 5.0]
@@ -218,9 +210,7 @@ def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Pa
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_repeats_before_a_board_agent_ended_them_are_booked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers: bool
-) -> None:
+def test_repeats_before_a_board_agent_ended_them_are_booked(tmp_path, monkeypatch, answers):
     run = Cut(tmp_path, FEED_ON)
     run.wait(run.config.backend.deadman_s)
     ended_s, before = run.clock.now(), run.truth("M0")["feed_ml"]

@@ -99,9 +99,7 @@ def test_setpoints_of_a_single_reactor_are_judged_as_those_of_all(reactor: str, 
     assert assemble.unpack(deployed(tmp_path, {}, backend=devices, each=within), tmp_path).policy is not None
 
 
-def test_a_policy_is_sound_at_the_very_ends_of_what_is_allowed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_policy_is_sound_at_the_very_ends_of_what_is_allowed(tmp_path, caplog):
     """Its regret is as large as may be, also by a limit of one's own; asked for are its lowest and highest setpoint."""
     edge = {"regret_pct": 10.0, "model": {"setpoints": [0.8, 0.65, 0.5]}, "updates": 1}
     assemble.unpack(deployed(tmp_path, edge, backend=ChiBioConfig()), tmp_path)
@@ -241,9 +239,7 @@ def lines(config: DeployConfig, folder: Path, caplog: pytest.LogCaptureFixture) 
     return [line for record in caplog.records if "  policy: " in (line := record.getMessage())]
 
 
-def test_the_device_is_looked_at_before_anything_was_trained(
-    device: ChiBioConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_device_is_looked_at_before_anything_was_trained(device, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     config = DeployConfig(backend=device, preflight_only=True, policy="latest")
     said = lines(config, tmp_path, caplog)
@@ -253,9 +249,7 @@ def test_the_device_is_looked_at_before_anything_was_trained(
     assert lines(replace(config, controller=registry.config("pi")), tmp_path, caplog) == []
 
 
-def test_a_preflight_says_whether_a_policy_would_be_refused(
-    device: ChiBioConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_preflight_says_whether_a_policy_would_be_refused(device, tmp_path, caplog):
     config = deployed(tmp_path, {}, backend=device, preflight_only=True)
     assert lines(config, tmp_path, caplog) == [
         "pass  policy: regret 0.1 % against the optimum of its model, setpoints 0.2 to 1, proven to be safe"

@@ -211,9 +211,7 @@ def step(minute: float, **told: Any) -> Step:
     return Step(**{key: np.array(v) if isinstance(v, list) else v for key, v in given.items()})
 
 
-def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own_window_was_held(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own_window_was_held(caplog):
     """M1 recovers first and moves on by its condition; a reading that is not believed counts for no error."""
     schedules = SCHEDULES[0], Scenario((0.8, 0.6), (40.0, 9.0), (37.0, 37.0), until=("od >= 0.9", None))
     reactors = SimpleNamespace(names=("M0", "M1"), handed_over=np.array([False, False]))
@@ -260,9 +258,7 @@ def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own
     ]
 
 
-def test_what_goes_wrong_without_a_new_sample_is_told_and_a_refusal_lasts_until_the_next_one(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_what_goes_wrong_without_a_new_sample_is_told_and_a_refusal_lasts_until_the_next_one(caplog):
     """M0 is refused its sample, then has none for two minutes; M1 falls silent; then both are well."""
     reactors, told = SimpleNamespace(names=("M0", "M1"), handed_over=np.zeros(2, dtype=bool)), []
     run = SimpleNamespace(reactors=reactors, progress=Progress((SCHEDULES[0], SCHEDULES[0])))

@@ -93,9 +93,7 @@ def uninterrupted() -> dict[str, list[Step]]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_resumed_run_decides_what_one_without_a_pause_decides(
-    kind: str, uninterrupted: dict[str, list[Step]], tmp_path: Path
-) -> None:
+def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind, uninterrupted, tmp_path):
     whole, continued = uninterrupted[kind], cut_and_continued(kind, tmp_path)
     assert decisions(continued) == decisions(whole)
     assert len({rate for rates in decisions(whole[CUT:]) for rate in rates}) > (1 if kind == "threshold" else 3)
@@ -105,9 +103,7 @@ def test_a_resumed_run_decides_what_one_without_a_pause_decides(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_without_its_memory_it_decides_something_else(
-    kind: str, uninterrupted: dict[str, list[Step]], tmp_path: Path
-) -> None:
+def test_without_its_memory_it_decides_something_else(kind, uninterrupted, tmp_path):
     cold = cut_and_continued(kind, tmp_path, forgets=True)
     assert decisions(cold)[:CUT] == decisions(uninterrupted[kind])[:CUT]
     assert decisions(cold) != decisions(uninterrupted[kind])
@@ -177,9 +173,7 @@ def test_a_dose_that_a_kill_interrupted_is_told_once_with_what_the_device_repeat
 
 
 @pytest.mark.parametrize("request_", REQUESTS)
-def test_what_is_put_off_is_told_once_across_a_kill(
-    request_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_put_off_is_told_once_across_a_kill(request_, tmp_path, monkeypatch):
     """0.24 mL are less than the pump can deliver: every second dose gives them together."""
     run = Cut(tmp_path, request_, 0.004, monkeypatch)
     run.begin()

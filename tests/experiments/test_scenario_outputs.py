@@ -205,9 +205,7 @@ def journal(run: Rehearsal, kind: str) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("request_", REQUESTS)
 @pytest.mark.parametrize("away_s", [5.0, pytest.param(200.0, marks=pytest.mark.slow)])
-def test_a_kill_in_a_dose_never_gives_it_twice_and_what_flowed_is_booked(
-    request_: str, away_s: float, tmp_path: Path
-) -> None:
+def test_a_kill_in_a_dose_never_gives_it_twice_and_what_flowed_is_booked(request_, away_s, tmp_path):
     """2 mL in two doses. One cut before its pump ran was not given; the device repeats one that ran every 63 s."""
     run = cut(tmp_path, request_)
     run.wait(away_s)

@@ -7,7 +7,6 @@ import shlex
 import signal
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -155,9 +154,7 @@ def test_a_stop_while_an_extension_module_loads_is_a_stop() -> None:
 
 @pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt])
 @pytest.mark.parametrize("writes", [False, True])
-def test_a_stop_that_a_library_takes_for_an_error_of_its_own_is_not_lost(
-    kept: Callable[[], AbstractContextManager[None]], writes: bool
-) -> None:
+def test_a_stop_that_a_library_takes_for_an_error_of_its_own_is_not_lost(kept, writes):
     """NumPy asks the type of an operand whether it has `__array_ufunc__`, and takes any error for a no.
 
     When the stop is raised again something may just be written, which is written to its end.
@@ -220,9 +217,7 @@ def test_a_closed_terminal_ends_nothing_that_was_started_to_outlive_it(kept: Cal
 
 
 @pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt])
-def test_a_stop_waits_until_the_writer_of_events_holds_no_lock(
-    kept: Callable[[], AbstractContextManager[None]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_waits_until_the_writer_of_events_holds_no_lock(kept, tmp_path, monkeypatch):
     written: list[str] = []
 
     def slow(of: str, call: Callable[..., None]) -> Callable[..., None]:

@@ -275,9 +275,7 @@ def begun(folder: Path) -> tuple[Rehearsal, RelativeController, ChangeLog]:
     return run, law, ChangeLog(run.loop)
 
 
-def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(tmp_path, caplog):
     """Some readings of M0 are made surprising; its rows say so."""
     run, law, log_changes = begun(tmp_path)
     spoilt = 0

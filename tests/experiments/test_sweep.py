@@ -165,9 +165,7 @@ def test_what_a_finished_job_found_stands_when_it_is_asked_for_something_else(tm
     [(main, "checkpoint.pt", True), (deploy.main, "state.json", False)],
     ids=["a training", "a deployment"],
 )
-def test_of_a_job_that_was_stopped_twice_each_life_is_kept_or_gone_on_with(
-    entry: frame.EntryPoint[Any], saved: str, goes_on: bool, tmp_path: Path
-) -> None:
+def test_of_a_job_that_was_stopped_twice_each_life_is_kept_or_gone_on_with(entry, saved, goes_on, tmp_path):
     """A training goes on from what it saved, to the same result. A deployment begins anew, on vials that are new: what
     its earlier lives left lies aside, in a folder each."""
     asked: list[str | None] = []
@@ -247,9 +245,7 @@ def test_what_an_earlier_life_left_goes_aside_but_its_record_and_its_log(tmp_pat
     assert not (tmp_path / "stopped_3").exists()
 
 
-def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_missing(tmp_path, monkeypatch):
     folder = tmp_path / "my sweep"
     for k, state in enumerate(("finished", "running", "running", "finished")):
         saved(folder, k, state)

@@ -133,9 +133,7 @@ def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_numb
     assert [[isinstance(cell, Emphasis) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
 
 
-def test_figures_have_the_best_eight_and_the_values_of_their_own_measure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_figures_have_the_best_eight_and_the_values_of_their_own_measure(tmp_path, monkeypatch):
     """Ten configurations, of which the third has no medium and the last two are in the table alone."""
     ranked = [
         sweep_results.Configuration(
@@ -246,9 +244,7 @@ def compared(folder: Path, **regrets: list[float]) -> str:
 @pytest.mark.parametrize(
     ("second", "apart"), [([5.0, 6.0, 7.0], True), ([2.5, 3.5, 4.5], False), ([0.5, 2.0, 9.0], False), ([3.5], True)]
 )
-def test_a_winner_whose_interval_meets_that_of_the_next_is_said_to_be_none(
-    second: list[float], apart: bool, tmp_path: Path
-) -> None:
+def test_a_winner_whose_interval_meets_that_of_the_next_is_said_to_be_none(second, apart, tmp_path):
     """The interval of 1, 2 and 3 is from 1 to 3, which the next one's begins below or above; one seed has none."""
     text = compared(tmp_path, a=[1.0, 2.0, 3.0], b=second)
     assert (

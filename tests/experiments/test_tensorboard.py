@@ -248,9 +248,7 @@ def test_a_run_can_be_watched_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
     events.close()
 
 
-def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_its_own_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_its_own_step(tmp_path, monkeypatch):
     """Evaluated at steps 100, 200 and 300 and at 250 and 300 of its second life, which began at 200."""
     tag = "eval/regret_pct"
     for first, steps in ((0, (100, 200, 300)), (200, (250, 300))):
@@ -271,9 +269,7 @@ def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_
 
 
 @pytest.mark.slow
-def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(runs, tmp_path, monkeypatch):
     """M1 has three rows, M0 those of the whole run; files of events are read by their second."""
     folder = tmp_path / "run"
     shutil.copytree(runs / "pi", folder)

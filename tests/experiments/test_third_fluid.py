@@ -108,9 +108,7 @@ def test_a_resumed_run_gives_the_drug_that_one_without_a_pause_gives() -> None:
     assert (pumps[:, 0] != pumps[:, 1]).any()
 
 
-def test_a_drug_on_the_alt_media_pump_of_a_pioreactor_goes_on_after_a_kill_in_its_dose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drug_on_the_alt_media_pump_of_a_pioreactor_goes_on_after_a_kill_in_its_dose(monkeypatch):
     first = Lab(monkeypatch, alt_media=True, speed=5.0, reading_s=1.0)
     world, config = first.world, first.reactors.config
     world.od_s = 1.0
@@ -234,8 +232,6 @@ def test_a_signal_without_a_part_is_refused() -> None:
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),
     ],
 )
-def test_what_cannot_give_it_is_refused_before_anything_begins(
-    changes: dict[str, Any], said: str, tmp_path: Path
-) -> None:
+def test_what_cannot_give_it_is_refused_before_anything_begins(changes, said, tmp_path):
     with pytest.raises(frame.UserError, match=said):
         assemble.unpack(drugged(**changes), tmp_path)

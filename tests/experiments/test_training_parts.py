@@ -133,9 +133,7 @@ THREE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_the_policy_of_a_run_is_that_of_its_best_seed_at_the_step_at_which_it_was_best(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_policy_of_a_run_is_that_of_its_best_seed_at_the_step_at_which_it_was_best(tmp_path, monkeypatch):
     monkeypatch.setattr(train_run, "_figures", Mock())
     one = session(tmp_path / "run", **THREE)
     seen = scripted(monkeypatch, one, MERITS)
@@ -256,9 +254,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.parametrize(("env", "agent"), TASKS)
-def test_what_is_resumed_from_a_checkpoint_is_the_uninterrupted_training_to_the_bit(
-    env: str, agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_resumed_from_a_checkpoint_is_the_uninterrupted_training_to_the_bit(env, agent, tmp_path, monkeypatch):
     """Every task with its agents: from amid an episode before the first update, and twice from among them.
 
     Two groups of agents; the second life has another number of threads. Records at steps 102 and 119 tell of the same
@@ -593,9 +589,7 @@ def captured(monkeypatch: pytest.MonkeyPatch, *names: str) -> dict[str, tuple[An
     return drawn
 
 
-def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the_optimum_second(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the_optimum_second(monkeypatch):
     drawn = captured(monkeypatch, "policy_map", "trajectories")
     env = EnvConfig(mu=0.03, tau=0.4, control_min=2.5, episode_steps=60, setpoints=(0.2, 0.3, 0.6, 0.9))
     DensityTask(env).figures(still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1]))
@@ -613,9 +607,7 @@ def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the
     np.testing.assert_allclose(theirs[1:] / theirs[:-1], np.interp(best_rates, env.pump_rates(), step_factors(env)))
 
 
-def test_maps_and_trajectories_of_a_relative_task_are_drawn_with_learned_first_and_the_optimum_second(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_maps_and_trajectories_of_a_relative_task_are_drawn_with_learned_first_and_the_optimum_second(monkeypatch):
     """In place of the optimum stands a law that gives the level of the growth share and leaves a tenth of an error."""
 
     def level(config: RelativeConfig, s: float, steps: int) -> Any:
@@ -675,9 +667,7 @@ def test_a_policy_of_estimates_says_with_which_estimator_it_was_meant(env: Any, 
     np.testing.assert_allclose([flies.low, flies.high], np.float32(task.limits))
 
 
-def test_learning_curves_are_drawn_of_every_agent_and_every_episode_that_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learning_curves_are_drawn_of_every_agent_and_every_episode_that_ended(tmp_path, monkeypatch):
     """Of two agents; in the first interval no episode ended, in the last one that of the second agent alone."""
     drawn = captured(monkeypatch, "learning")
     monkeypatch.setattr("experiments.reporting.charts.save", lambda figure, folder, name: folder / f"{name}.png")
@@ -696,9 +686,7 @@ def test_learning_curves_are_drawn_of_every_agent_and_every_episode_that_ended(
     assert writer.events.picture.call_args.args == ("figures/learning", tmp_path / "figures" / "learning.png", 120)
 
 
-def test_start_and_end_are_told_with_all_seeds_their_worst_and_the_command_that_follows(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_start_and_end_are_told_with_all_seeds_their_worst_and_the_command_that_follows(tmp_path, caplog):
     """Of two species, resumed at step 40; the following command runs the policy with the pair it is for."""
     task, path = Coculture(CocultureConfig(preview_min=60.0, control_min=20.0)), tmp_path / "policy.npz"
     kept, myopic = scored([0.1, 0.9, 0.2], [[0.001], [0.002], [0.02]]), scored([-7.0], [[0.3]])
