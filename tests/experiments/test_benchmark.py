@@ -25,11 +25,9 @@ from experiments.reporting import charts
 from experiments.training import run as training
 from tests.experiments.test_deploy import inverse_policy
 
-pytestmark = pytest.mark.numeric
-
 ROOT = Path(__file__).parents[2]
 STEPS = "setpoint_steps studies.setpoint_steps"
-pytestmark = pytest.mark.xdist_group("benchmark")  # its tests share loops
+pytestmark = [pytest.mark.numeric, pytest.mark.xdist_group("benchmark")]  # its tests share loops
 
 
 @cache
