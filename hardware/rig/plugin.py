@@ -21,10 +21,10 @@ REFERENCE = 0.1  # V of the photodiode that looks at the lamp
 NOISE = 0.02  # sd of one look, as a fraction; forty of them are averaged
 
 
-def ask(what: dict[str, Any]) -> dict[str, Any]:
-    """Ask the rig; nothing after half a second."""
+def ask(what: dict[str, Any], timeout_s: float = 0.5) -> dict[str, Any]:
+    """Ask the rig; nothing after the timeout."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-        wire.settimeout(0.5)
+        wire.settimeout(timeout_s)
         try:
             wire.sendto(json.dumps({"unit": UNIT, "pid": os.getpid(), **what}).encode(), ("127.0.0.1", int(PORT)))
             answer: dict[str, Any] = json.loads(wire.recv(4096))
@@ -80,7 +80,7 @@ def install() -> None:
         def __setattr__(self, name: str, value: Any) -> None:
             super().__setattr__(name, value)
             if name == "dc":
-                ask({"pin": int(self.pin), "dc": float(value)})
+                ask({"pin": int(self.pin), "dc": float(value)}, 10.0)  # a pin is switched before its job goes on
 
     pwm.MockPWMOutputDevice = Output
 

@@ -68,7 +68,7 @@ def test_jobs_killed_or_told_to_end_are_queued_again_and_end_with_the_weights_of
         )  # fmt: skip
     try:
         until((folder / "0/checkpoint.pt").is_file, process)
-        array = next(path.name for path in (folder / ".submitit").iterdir()).partition("_")[0]
+        array = next(path.name for path in (folder / ".submitit").glob("[0-9]*_*")).partition("_")[0]
         subprocess.run(["scontrol", "requeue", f"{array}_0"], env=cluster, check=True)
         kill(f"{array}_0")
         until((folder / "1/checkpoint.pt").is_file, process)

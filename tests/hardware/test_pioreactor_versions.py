@@ -16,6 +16,7 @@ import pytest
 
 from envs.plant.plant import Plant
 from hardware.clock import RealClock
+from hardware.errors import ProtocolError
 from hardware.pioreactor.config import PioreactorConfig, RigConfig
 from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.pioreactor.versions import TESTED, Facts, facts
@@ -68,8 +69,16 @@ class Asked:
         return said[-1]
 
     def jobs(self) -> list[str]:
-        """Names of the jobs that the unit lists."""
-        return [job["job_name"] for job in self.web.running()]
+        """Names of the jobs that the unit lists; a busy one answers with an error while a job begins."""
+        said = list[list[dict[str, Any]]]()
+
+        def told() -> bool:
+            with suppress(ProtocolError):
+                said.append(self.web.running())
+            return bool(said)
+
+        assert until(told)
+        return [job["job_name"] for job in said[0]]
 
     def settings(self, job: str) -> dict[str, Any]:
         """Of a running job; none of one that does not run."""
