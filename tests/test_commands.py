@@ -41,7 +41,6 @@ LESS = {
     "tests.campaigns.faults": ["controls=0", "moments=[dose]", "faults=[feed weak]"],
     "tests.campaigns.kills": ["kills=2", "runs=1"],
     "tests.campaigns.soak": ["days=0.05"],
-    "tests.studies.speed": ["runs=5", "groups=[mpc]"],
 }
 """Command -> what makes it shorter here without leaving out a part of it."""
 

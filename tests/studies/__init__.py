@@ -1,1 +1,1 @@
-"""What the choices of an agent are worth, and how fast things are beside rivals."""
+"""What the choices of an agent are worth."""
