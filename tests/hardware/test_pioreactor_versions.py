@@ -209,12 +209,12 @@ def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_comma
     unit.run("add_media", {"duration": 0.1})
     assert until(lambda: len(unit.vial.pulses) > had)
     assert until(lambda: not unit.pumping() and not unit.rig.jobs(UNIT, "add_media"))
-    assert unit.jobs().count("add_media") == 1, "a killed job is never taken off the list by itself"
+    assert "add_media" in unit.jobs(), "a killed job is never taken off the list by itself"
     forget = {"pio jobs remove", "pio jobs purge"} - {unit.known.forget}
     assert all(unit.pio(f"{command} --job-name add_media") == 2 for command in forget)
     if unit.known.forget:
         assert unit.pio(f"{unit.known.forget} --job-name add_media") == 0
-        assert "add_media" not in unit.jobs()
+        assert until(lambda: "add_media" not in unit.jobs())
 
 
 @rig
