@@ -13,6 +13,8 @@ __all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 
+ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -43,8 +45,12 @@ class Scenario:
     ratio_sine: tuple[float, ...] = setting(
         (), "in place of ratios a sine that falls first: mean, amplitude and period in min; empty: none"
     )
-    announce_min: float = setting(
-        360.0, "how long before it a change of the share is told to its controller; 0: never", "min", within=(0, 1440)
+    announce_min: float | None = setting(
+        None,
+        "how long ahead the controllers know of a change of the setpoint or the share; 0: never; null: 360 where a "
+        "share is asked for, else 0",
+        "min",
+        within=(0, 1440),
     )
     until: tuple[str | None, ...] = setting(
         (),
@@ -109,6 +115,12 @@ class Scenario:
     def composed(self) -> bool:
         """Whether a share is asked for at any time."""
         return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
+
+    @property
+    def announced_min(self) -> float:
+        """How long ahead a change is known, min; 0: never."""
+        usual = ANNOUNCED_MIN if self.composed else 0.0
+        return usual if self.announce_min is None else self.announce_min
 
     def resting(self, even_c: float) -> "Scenario":
         """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""

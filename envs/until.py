@@ -46,7 +46,7 @@ class Condition:
 class Conditions:
     """The conditions of N reactors' steps, (N, P); rows shorter than P are padded with None.
 
-    Attributes: any, whether there is one at all; texts, as given.
+    Attributes: given, where there is one, (N, P); any, whether there is one at all; texts, as written.
     """
 
     def __init__(self, texts: list[list[str | None]]) -> None:
@@ -54,7 +54,8 @@ class Conditions:
         bounds = np.array([[Condition(text).bounds for text in row] for row in texts], dtype=np.float64)
         self._least, self._most = bounds[..., 0], bounds[..., 1]
         self._settled = np.array([[text == "settled" for text in row] for row in texts])
-        self.any = any(text is not None for row in texts for text in row)
+        self.given = np.array([[text is not None for text in row] for row in texts])
+        self.any = bool(self.given.any())
 
     def met(self, phase: NDArray[np.intp], od: Array, settled: Mask) -> Mask:
         """Whether each reactor's step ends, (N,): OD at its level, or settled where that is asked for.

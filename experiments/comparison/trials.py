@@ -188,7 +188,9 @@ def _closed(
         plant, SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates))), bench.control_min
     )
     controller, further, safety = make(plant, bench)
-    loop = ClosedLoop(reactors, controller, Interlock(replicates, safety, bench), schedule, further=further)
+    loop = ClosedLoop(
+        reactors, controller, Interlock(replicates, safety, bench), schedule, further=further, model=model
+    )
     loop.density.known(plant, reactors.config.pump_ml_s, bench)
     return loop, plant
 

@@ -37,8 +37,9 @@ from experiments.laws.share.program import Program
 from experiments.laws.share.recall import Recall
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
+from experiments.loop.progress import Progress
 from experiments.loop.share import LightSignal, Share, program_of
-from experiments.loop.signals import Signal
+from experiments.loop.signals import AIM, Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop, is_over
 from hardware.errors import ReactorError, UnfitError
@@ -94,7 +95,8 @@ class Setup:
     @property
     def columns(self) -> tuple[str, ...]:
         """Of the recordings."""
-        return (*COLUMNS, *(column for signal in self.further for column in signal.columns))
+        aim = (AIM,) if Progress(self.scenarios).announced else ()
+        return (*COLUMNS, *aim, *(column for signal in self.further for column in signal.columns))
 
 
 def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
@@ -360,7 +362,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
     loop = ClosedLoop(
         reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale,
-        setup.family.actuators(setup.backend),
+        setup.family.actuators(setup.backend), setup.model,
     )  # fmt: skip
     if plant is not None:
         loop.density.known(plant, flow, setup.bench)

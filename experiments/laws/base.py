@@ -64,6 +64,25 @@ class Accounts(Protocol):
         """Fresh medium that went in, or was put off to the next dose, since this was last called, mL, shape (N,)."""
 
 
+class Speeds(Protocol):
+    """What an estimator knows of how fast a culture goes up and down (`experiments/laws/density/estimators.py`)."""
+
+    @property
+    def full_pump(self) -> Array:
+        """What one period of full pump takes off ln OD, (N,)."""
+
+    def relative(self, setpoint: Array) -> tuple[Array, Array]:
+        """Return error and growth share, (N,) each."""
+
+
+@runtime_checkable
+class Estimates(Protocol):
+    """A controller that estimates growth and pump."""
+
+    @property
+    def estimator(self) -> Speeds: ...
+
+
 @runtime_checkable
 class Watches(Protocol):
     """A controller that learns from every believed reading, also before the schedule begins, and from temperature."""

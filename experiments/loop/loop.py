@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.laws.base import Array, Controller, Mask
+from envs.task import EnvConfig
+from experiments.laws.base import Array, Controller, Estimates, Mask
+from experiments.laws.density.estimators import WithEstimator
 from experiments.loop.progress import Progress
-from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, fitting, shaped
+from experiments.loop.signals import AIM, Answer, Count, Counted, Density, Sample, Signal, fitting, shaped
 from experiments.loop.supply import Supply
 from hardware import memory
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
@@ -87,6 +89,7 @@ class ClosedLoop:
       scale: of each culture over that of the law's model, as of `Density`.
       further: signals beside the density; each commands its actuator, in place of the schedules wherever it decides.
       actuators: what the reactors have.
+      model: growth model with which an estimator begins beside a controller that has none, where changes are announced.
     Raises: ValueError for another number of schedules than of reactors, two signals with one actuator, or one whose
       actuator the reactors do not have.
     """
@@ -104,21 +107,24 @@ class ClosedLoop:
         further: Sequence[Signal] = (),
         scale: Array | float = 1.0,
         actuators: Sequence[Actuator] = (FEED, THERMOSTAT),
+        model: EnvConfig = EnvConfig(),  # noqa: B008 (frozen)
     ) -> None:
         n = len(reactors.names)
         self.reactors, self.interlock = reactors, interlock
-        self.density = Density(controller, scale, interlock.bench.max_rate)
-        self.signals = fitting([self.density, *further], actuators)
-        by_name = {actuator.name: actuator for actuator in actuators}
-        self._commanded = [(signal, by_name[signal.actuator]) for signal in further if signal.actuator]
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
+        self.progress = Progress(self.schedules)
+        if self.progress.announced and not isinstance(controller, Estimates):
+            controller = WithEstimator(controller, model)
+        self.density = Density(controller, scale, interlock.bench.max_rate, interlock.bench.control_min)
+        self.signals = fitting([self.density, *further], actuators)
+        by_name = {actuator.name: actuator for actuator in actuators}
+        self._commanded = [(signal, by_name[signal.actuator]) for signal in further if signal.actuator]
         self._before_dose = before_dose
         self._at_end = np.array([at_end] * n if isinstance(at_end, str) else list(at_end))
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
-        self.progress = Progress(self.schedules)
         asked = [actuator.pump for _, actuator in self._commanded if actuator.pump]
         self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s, asked)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
@@ -153,7 +159,8 @@ class ClosedLoop:
         phase, setpoint, temperature = self.progress.asked(elapsed)
         self.done = self.done | (rows & (elapsed >= self.progress.totals - 1e-6))
 
-        sample = Sample.of(m, self.interlock, rows, believed, elapsed, phase, setpoint, temperature)
+        ahead = self.progress.following(elapsed) if self.progress.announced else None
+        sample = Sample.of(m, self.interlock, rows, believed, elapsed, phase, setpoint, temperature, ahead)
         decided = self.density.decide(sample)
         commands: dict[str, Array] = {}
         for signal, actuator in self._commanded:
@@ -168,11 +175,11 @@ class ClosedLoop:
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
         proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.bench.period_s)
-        verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
+        verdict = self.interlock.check(m, proposed, self.density.aim, temperature, now)
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
-        columns: dict[str, Array] = {}
+        columns: dict[str, Array] = {AIM: self.density.aim} if self.progress.announced else {}
         explanation: dict[str, Array] = {}
         reasons: Sequence[str | None] = verdict.reasons
         for signal in self.signals:

@@ -42,6 +42,7 @@ class Progress:
         self.conditions = Conditions([[*s.until, *[None] * (width - len(s.until))] for s in schedules])
         self.conditional = self.conditions.any
         self.remembers = ("edges", "within_since", "judged_at") if self.conditional else ()
+        self._announced_min = np.array([s.announced_min for s in schedules])
         self._band = np.array([s.settled_band for s in schedules])
         self._settled_min = np.array([s.settled_min for s in schedules])
         self.edges = _padded([s.edges.tolist() for s in schedules], np.inf)
@@ -64,6 +65,24 @@ class Progress:
         phase = self.phase(elapsed)
         at = np.arange(phase.size), np.maximum(phase, 0)
         return phase, self._setpoints[at], self._temperatures[at]
+
+    @property
+    def announced(self) -> bool:
+        """Whether any change of a setpoint is known ahead."""
+        changes = (np.diff(self._setpoints, axis=1) != 0.0).any(axis=1)
+        return bool((changes & (self._announced_min > 0.0)).any())
+
+    def following(self, elapsed: Array) -> tuple[Array, Array]:
+        """Return the next setpoint and the minutes until it, inf where none is known ahead, each (N,).
+
+        Nobody knows ahead when a step with a condition ends.
+        """
+        phase, setpoint, _ = self.asked(elapsed)
+        rows, step = np.arange(phase.size), np.maximum(phase, 0)
+        following = np.minimum(step + 1, self._counts - 1)
+        left = self.edges[rows, step + 1] - elapsed
+        known = (phase >= 0) & (following > step) & (left <= self._announced_min) & ~self.conditions.given[rows, step]
+        return np.where(known, self._setpoints[rows, following], setpoint), np.where(known, left, np.inf)
 
     def watch(self, elapsed: Array, od: Array, believed: Mask) -> Mask:
         """Take a sample; True where it ends a step, (N,). Args: believed: rows whose OD is new and believed."""

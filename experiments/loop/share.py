@@ -150,7 +150,7 @@ class Share:
         found = np.empty((3, elapsed.size))
         for schedule in set(self.schedules):
             rows = np.array([other == schedule for other in self.schedules])
-            wanted = program_of(schedule).wanted(elapsed[rows], schedule.announce_min)
+            wanted = program_of(schedule).wanted(elapsed[rows], schedule.announced_min)
             found[:, rows] = wanted.setpoint, wanted.following, wanted.minutes
         return Wanted(*found)
 

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
+from experiments.laws.base import Accounts, Array, Controller, Estimates, Explains, Mask, Watches
 from hardware.actuator import FEED, Actuator
 from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
 __all__ = [
+    "AIM",
     "ESTIMATED",
     "FILTER_ALARM",
     "TRUE",
@@ -39,6 +40,8 @@ __all__ = [
 
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
+MOST_PERIODS = 1e4  # for half of a transition that the estimate takes for impossible
+AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
 FILTER_ALARM = "filter_alarm"  # in a row; on the screen the supervisor's beginning and end are said
 PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
@@ -52,6 +55,8 @@ class Sample:
     rows: reactors with a new sample; believed: those whose OD is taken for the culture's.
     minute: when it was taken, min since the run began. elapsed: min since the schedule began, nan before.
     phase: of the schedule, -1 before. setpoint: OD asked for. temperature: the schedule's target, degC.
+    following, left_min: the setpoint after it and the minutes until then, inf where it is not known yet; None where no
+      change is known ahead.
     limits: lowest and highest target of the thermostat, degC.
     """
 
@@ -65,17 +70,20 @@ class Sample:
     setpoint: Array
     temperature: Array
     limits: tuple[float, float]
+    following: Array | None = None
+    left_min: Array | None = None
 
     @classmethod
     def of(
         cls, m: Measurement, interlock: Interlock, rows: Mask, believed: Mask, elapsed: Array, phase: NDArray[np.intp],
-        setpoint: Array, temperature: Array,
+        setpoint: Array, temperature: Array, ahead: tuple[Array, Array] | None = None,
     ) -> "Sample":  # fmt: skip
         """Build a sample: a measurement with what the interlock says of its light and of targets."""
         light, safety = interlock.fluorescence(m), interlock.config
         light = np.full(m.od.shape, np.nan) if light is None else light
         limits = safety.composition_low, safety.composition_high
-        return cls(m, light, rows, believed, m.time_s / 60.0, elapsed, phase, setpoint, temperature, limits)
+        schedule = elapsed, phase, setpoint, temperature, limits, *(ahead or ())
+        return cls(m, light, rows, believed, m.time_s / 60.0, *schedule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,16 +166,29 @@ class Density:
     A culture of volume s V answers to a rate s u as one of V does to u, since tau = V/60. So a law whose model is of V
     decides for every volume.
 
+    A change of the setpoint that is known ahead is aimed at half of its transition before it comes: OD is half-way, in
+    ln OD, when the setpoint changes, and the integral of the squared error is a quarter of what it is without. The
+    transition takes |ln(r'/r)| / (s B) periods up and |ln(r'/r)| / ((1 - s) B) down, with growth share s and full pump
+    B as the law estimates them (`envs/relative.py`).
+
     Args: law: decides on the pump rate; what it can do beyond is asked of it. scale: s, (N,) or one for all.
-      max_rate: largest rate, mL/s.
+      max_rate: largest rate, mL/s. period_min: control period.
+    Attributes: aim: setpoint that the law was given last, (N,).
     """
 
     name, actuator = "controller", FEED.name
     columns: tuple[str, ...] = ()  # the recording has them in any case
     sees_light = False
 
-    def __init__(self, law: Controller, scale: Array | float = 1.0, max_rate: float = math.inf) -> None:
-        self.law, self._scale, self._max_rate = law, scale, max_rate
+    def __init__(
+        self,
+        law: Controller,
+        scale: Array | float = 1.0,
+        max_rate: float = math.inf,
+        period_min: float = 1.0,
+    ) -> None:
+        self.law, self._scale, self._max_rate, self._period_min = law, scale, max_rate, period_min
+        self.aim = np.empty(0)
         self.truth: Callable[[Array], tuple[Array, Array]] | None = None
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
@@ -189,15 +210,25 @@ class Density:
         m = sample.measured
         if isinstance(self.law, Watches):
             self.law.watch(m.od, m.temperature, sample.minute, sample.believed)
-        od = np.where(sample.rows & ~sample.believed, np.nan, m.od)
-        rate = self.law.act(od, sample.setpoint, sample.minute, sample.believed & (sample.phase >= 0))
+        od, self.aim = np.where(sample.rows & ~sample.believed, np.nan, m.od), self._aim(sample)
+        rate = self.law.act(od, self.aim, sample.minute, sample.believed & (sample.phase >= 0))
         return np.where(np.equal(self._scale, 1.0), rate, np.minimum(rate * self._scale, self._max_rate))
+
+    def _aim(self, sample: Sample) -> Array:
+        if sample.following is None or sample.left_min is None or not isinstance(self.law, Estimates):
+            return sample.setpoint
+        full, share = self.law.estimator.full_pump, self.law.estimator.relative(sample.setpoint)[1]
+        change = np.log(sample.following / sample.setpoint)
+        speed = full * np.where(change > 0.0, share, 1.0 - share)  # of ln OD in one period
+        half = np.divide(0.5 * np.abs(change), speed, out=np.full(share.size, MOST_PERIODS), where=speed > 0.0)
+        begun = sample.left_min <= (half + 0.5) * self._period_min  # by the sample that is nearest
+        return np.where(begun, sample.following, sample.setpoint)
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """See `Signal.find`; in a simulation also what e and s truly are, where the law estimates them."""
         why = self.law.explain() if isinstance(self.law, Explains) else {}
         if self.truth is not None and "growth_share" in why:
-            why = {**why, **dict(zip(TRUE, self.truth(sample.setpoint), strict=True))}
+            why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
         alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
         said = "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
         return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.loop.loop import Step
+from experiments.loop.signals import AIM
 from experiments.reporting import tables
 from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
 from experiments.reporting.tensorboard import Events
@@ -18,6 +19,7 @@ __all__ = ["Curves"]
 Array = NDArray[np.float64]
 
 NAMES = {  # of the columns that the share adds to a recording; those of other signals keep theirs below further/
+    AIM: "culture/aim",
     "fluorescence": "share/fluorescence",
     "ratio_setpoint": "share/setpoint",
     "ratio": "share/estimate",

@@ -14,7 +14,7 @@ from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
 from experiments.loop.share import program_of
-from experiments.loop.signals import FILTER_ALARM
+from experiments.loop.signals import AIM, FILTER_ALARM
 from experiments.record.record import Recordings
 from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
@@ -41,6 +41,7 @@ FORMATS = {  # of the metrics of a window
     "itae_mean": "8.3f",
     "settling_min": "8.1f",
     "steady_abs_error": "8.4f",
+    "abs_error": "8.4f",
 }
 AGAIN_S = 3600.0
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
@@ -130,7 +131,7 @@ class ChangeLog:
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
     """Format a head and one line per window of a summary."""
-    heads = ("setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
+    heads = ("setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady", "mean |e|")
     lines = [f"{'reactor':8} " + " ".join(f"{head:>8}" for head in heads)]
     for w in windows:
         cells = [f"{w[key]:{form}}" if w[key] == w[key] else f"{'–':>8}" for key, form in FORMATS.items()]
@@ -246,8 +247,9 @@ def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> F
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = c["temperature_degc"].T if switched else None
     series = (c["time_min"].T, table.od().T, _setpoint(table).T, c["pump_rate_ml_s"].T)
+    aim = c[AIM].T if AIM in c else None
     marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks if m.share is None]
-    return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
+    return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T, aim)
 
 
 def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
@@ -255,7 +257,7 @@ def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], spec
     announced, counted = [], []
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
         began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
-        minute, share = program_of(scenario).announcements(scenario.announce_min)
+        minute, share = program_of(scenario).announcements(scenario.announced_min)
         known = minute + began <= np.nanmax(table.columns["time_min"][n], initial=-np.inf)  # a run may end before
         announced.append((minute[known] + began, share[known]))
         mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]

@@ -213,11 +213,13 @@ def closed_loop(
     title: str = "",
     marks: Sequence[tuple[float, str]] = (),
     refused: Array | None = None,
+    aim: Array | None = None,
 ) -> Figure:
     """Draw a recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
       marks: minute and text of vertical lines. refused: OD that was not believed, (K, N); at the edge where it is far.
+      aim: setpoint that the controller was given, (K, N), where changes are known ahead.
     """
     unit, sign = clock(float(np.nanmax(minutes, initial=0.0)))
     time, rows = minutes / unit, 2 if temperature is None else 3
@@ -230,6 +232,11 @@ def closed_loop(
             time[:, n], setpoint[:, n], where="post", color="black" if n == 0 else colour, linewidth=0.9,
             linestyle="--", label="setpoint" if n == 0 else None,
         )  # fmt: skip
+        if aim is not None:
+            axes[0].step(
+                time[:, n], aim[:, n], where="post", color=colour, linewidth=0.9, linestyle=":",
+                label="given to the controller" if n == 0 else None,
+            )  # fmt: skip
         axes[1].step(time[:, n], rate[:, n] * 1000.0, where="post", color=colour, linewidth=1.0)
         if temperature is not None:
             axes[2].plot(time[:, n], temperature[:, n], color=colour, linewidth=1.0)

@@ -84,8 +84,9 @@ def test_no_rate_for_a_larger_volume_passes_the_cap() -> None:
     law = SimpleNamespace(act=lambda *_given: np.array([0.004, 0.015, 0.02]))
     yes, none = np.ones(3, dtype=bool), np.zeros(3)
     sample = SimpleNamespace(
-        measured=SimpleNamespace(od=none), rows=yes, believed=yes, setpoint=none, minute=none, phase=none
-    )
+        measured=SimpleNamespace(od=none), rows=yes, believed=yes, setpoint=none, minute=none, phase=none,
+        following=None, left_min=None,
+    )  # fmt: skip
     rate = Density(law, np.array([1.5, 1.5, 0.5]), 0.02).decide(sample)  # type: ignore[arg-type]
     assert rate.tolist() == pytest.approx([0.006, 0.02, 0.01])
 

@@ -175,10 +175,10 @@ def under(head: str, table: str, line: int) -> str:
 
 def test_every_metric_stands_under_its_own_heading_on_the_console() -> None:
     window = {"reactor": "M1", "setpoint": 0.65, "ise": 0.1234, "itae": 5.67, "ise_mean": 0.00411, "itae_mean": 0.189}
-    window |= {"settling_min": 12.5, "steady_abs_error": 0.0123}
+    window |= {"settling_min": 12.5, "steady_abs_error": 0.0123, "abs_error": 0.0456}
     table = summary.metrics_table([window, {**window, "reactor": "M0", "settling_min": math.nan}])
     heads = {"setpoint": "0.65", "ISE": "0.1234", "ITAE": "5.67", "ISE/T": "0.00411", "ITAE/T": "0.189"}
-    heads |= {"settled": "12.5", "steady": "0.0123"}
+    heads |= {"settled": "12.5", "steady": "0.0123", "mean |e|": "0.0456"}
     assert {head: under(f" {head}", table, 1) for head in heads} == heads
     assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M0"]
     assert under("settled", table, 2) == "–"

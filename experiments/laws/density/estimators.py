@@ -7,11 +7,11 @@ from dataclasses import asdict
 from typing import Any, NamedTuple, Protocol
 
 from envs.task import EnvConfig
-from experiments.laws.base import Array, Mask
+from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
 from experiments.laws.density.estimator import Estimator, EstimatorConfig, fixed
 from hardware.memory import Remembers
 
-__all__ = ["DensityEstimator", "add", "build", "config_at", "settings"]
+__all__ = ["DensityEstimator", "WithEstimator", "add", "build", "config_at", "settings"]
 
 
 class DensityEstimator(Remembers, Protocol):
@@ -108,3 +108,43 @@ def settings(config: Any) -> dict[str, Any]:
     own = {f"estimator.{key}": value for key, value in asdict(config).items()}
     fixed = {f"filter.{key}": value for key, value in KINDS[config.kind].fixed().items()}
     return {key: list(value) if isinstance(value, tuple) else value for key, value in (own | fixed).items()}
+
+
+class WithEstimator:
+    """A controller that estimates nothing, and the default estimator beside it, which decides nothing.
+
+    Args: law: the controller. model: mu, tau and control period with which the estimator begins.
+    """
+
+    def __init__(self, law: Controller, model: EnvConfig) -> None:
+        self.law, self.estimator = law, build(EstimatorConfig(), model)
+        self.remembers = ("law", "estimator") if isinstance(law, Remembers) else ("estimator",)
+
+    def reset(self, n: int) -> None:
+        """See `Controller.reset`."""
+        self.law.reset(n)
+        self.estimator.reset(n)
+
+    def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """See `Watches.watch`."""
+        self.estimator.watch(od, temperature, minute, rows)
+        if isinstance(self.law, Watches):
+            self.law.watch(od, temperature, minute, rows)
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """See `Controller.act`: the law's."""
+        self.estimator.see(od, minute, rows)
+        rate = self.law.act(od, setpoint, minute, rows)
+        self.estimator.decided(rate)
+        return rate
+
+    def dosed(self, volume_ml: Array) -> None:
+        """See `Accounts.dosed`."""
+        self.estimator.dosed(volume_ml)
+        if isinstance(self.law, Accounts):
+            self.law.dosed(volume_ml)
+
+    def explain(self) -> dict[str, Array]:
+        """Explain the law's decision, and the estimates by which changes are aimed ahead."""
+        own = self.law.explain() if isinstance(self.law, Explains) else {}
+        return self.estimator.explain() | own
