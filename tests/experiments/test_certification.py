@@ -325,6 +325,16 @@ def test_the_law_of_another_period_divides_it_out() -> None:
     assert one.half_width(found.low, found.high)[0] == pytest.approx(np.expm1(0.00375), abs=1e-9)
 
 
+def test_the_law_of_a_strip_is_that_of_each_of_its_setpoints_and_of_every_reading() -> None:
+    """Setpoints 0.2 to 0.5, readings within 0.02, periods of 2 min: the rate nearest to it is among those found."""
+    found = replace(loop(0.2, 0.5), control_min=2.0).law(OdCase("", 0.0, 0.02))
+    d, r, off = np.meshgrid(np.linspace(-0.3, 0.4, 141), np.linspace(0.2, 0.5, 31), np.linspace(-0.02, 0.02, 5))
+    wanted = (0.03 + np.log(np.exp(d) + off / r) / 2.0) / 3.0
+    level = np.clip(np.rint(wanted / 0.00125), 0, 16).astype(int)
+    assert (found.low[0][level] <= d + 1e-9).all()
+    assert (found.high[0][level] >= d - 1e-9).all()
+
+
 def test_the_band_is_that_of_the_worst_simulated_culture() -> None:
     """Extremes of mu, tau and noise in every combination of two alternating values, 400 periods from far off."""
     policy, r, share, noise = laws.law(), 0.6, 0.3, 0.0108

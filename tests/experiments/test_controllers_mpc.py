@@ -132,19 +132,22 @@ def test_a_plan_is_in_the_rates_of_the_pump_that_is_there() -> None:
 
 
 def test_a_decision_begins_at_the_last_plan_a_period_on_and_of_each_reactor_at_its_own(monkeypatch):
-    """The last move stands twice. The second reactor has no reading once, and keeps its plan for the next time."""
+    """The last move stands twice. The first reactor has no reading once, and keeps its plan for the next time."""
     plans = [np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), np.array([[0.7, 0.8, 0.9]]), np.zeros((2, 3))]
-    starts: list[list[list[float]]] = []
+    starts, problems = list[list[list[float]]](), list[Problem]()
     monkeypatch.setattr(
-        Problem, "by_gradient", lambda _, start: starts.append(start.tolist()) or plans[len(starts) - 1]
+        Problem,
+        "by_gradient",
+        lambda problem, start: problems.append(problem) or starts.append(start.tolist()) or plans[len(starts) - 1],
     )
     mpc = Mpc(MpcConfig(solver="gradient", horizon=3), EnvConfig(mu=0.03, tau=0.4))
     mpc.reset(2)
-    od, setpoint, both = np.full(2, 0.5), np.full(2, 0.5), np.ones(2, dtype=bool)
-    rates = [mpc.act(od, setpoint, np.zeros(2), rows).tolist() for rows in (both, np.array([True, False]), both)]
-    assert starts[1:] == [[[0.2, 0.3, 0.3]], [[0.8, 0.9, 0.9], [0.5, 0.6, 0.6]]]
+    od, setpoint, both = np.array([0.5, 0.6]), np.array([0.4, 0.7]), np.ones(2, dtype=bool)
+    rates = [mpc.act(od, setpoint, np.zeros(2), rows).tolist() for rows in (both, np.array([False, True]), both)]
+    assert starts[1:] == [[[0.5, 0.6, 0.6]], [[0.2, 0.3, 0.3], [0.8, 0.9, 0.9]]]
+    assert [[*p.start, *p.setpoint] for p in problems] == [[0.5, 0.6, 0.4, 0.7], [0.6, 0.7], [0.5, 0.6, 0.4, 0.7]]
     np.testing.assert_allclose(starts[0], 0.6)  # mu tau of 0.02 mL/s
-    np.testing.assert_allclose(rates, [[0.002, 0.008], [0.014, 0.008], [0.0, 0.0]])
+    np.testing.assert_allclose(rates, [[0.002, 0.008], [0.002, 0.014], [0.0, 0.0]])
 
 
 def test_a_swarm_is_never_worse_than_the_place_where_it_is_told_to_begin() -> None:
