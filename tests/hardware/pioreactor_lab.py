@@ -600,7 +600,7 @@ class Lab:
 
     def ledger(self, planned_ml: float) -> FeedBudget:
         """What the interlock has booked: a dose when it began, with all that the driver said of it since."""
-        budget = FeedBudget(SafetyConfig(), self.bench, np.full(1, self.bench.volume_ml), np.full(1, 1e3))
+        budget = FeedBudget(SafetyConfig(), self.bench, self.bench.volumes([UNIT]), np.full(1, 1e3))
         budget.book(np.array([planned_ml]), np.array([2.0 * planned_ml]), 0.0)
         self.book(budget)
         return budget

@@ -406,10 +406,13 @@ def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put
     assert [row["carry_ml"] for row in lab.of("intent")] == pytest.approx([0.03, 0.03, 0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(("volume_ml", "rim_ml"), [(14.0, 20.0), (30.0, 40.0)])
-def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch, volume_ml, rim_ml):
+@pytest.mark.parametrize(
+    ("bench", "rim_ml"),
+    [({"volume_ml": 14.0}, 20.0), ({"volume_ml": 30.0}, 40.0), ({"volume_ml": 30.0, "volumes_ml": {UNIT: 14.0}}, 20.0)],
+)
+def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch, bench, rim_ml):
     """A media pump that stood on for half a minute gave some 21 mL; a stop drains nothing."""
-    lab = sampled(monkeypatch, volume_ml=volume_ml)
+    lab = sampled(monkeypatch, **bench)
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 29.0
     planned = lab.dose(0.7)
     lab.until(lambda: bool(lab.world.since), 5.0)
