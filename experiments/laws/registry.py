@@ -12,7 +12,14 @@ from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.laws.base import Array
-from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.laws.density.baselines import (
+    GainScheduled,
+    GainScheduledConfig,
+    Hold,
+    HoldConfig,
+    Threshold,
+    ThresholdConfig,
+)
 from experiments.laws.density.inverse import Inverse, InverseConfig
 from experiments.laws.density.learned import LearnedConfig, learned
 from experiments.laws.density.mpc import Mpc, MpcConfig
@@ -69,6 +76,7 @@ KINDS: dict[str, dict[str, LawKind]] = {
         "mpc": LawKind(MpcConfig, Mpc, ("model",)),
         "inverse": LawKind(InverseConfig, Inverse, ("model",)),
         "threshold": LawKind(ThresholdConfig, Threshold),
+        "gain_scheduled": LawKind(GainScheduledConfig, GainScheduled, ("model",)),
         "hold": LawKind(HoldConfig, Hold, ("model",)),
         "oracle": LawKind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
     },

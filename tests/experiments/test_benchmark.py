@@ -54,7 +54,9 @@ def total(t: DensityTrial, metric: str) -> float:
     return float(np.mean([getattr(t.score(w), metric).mean() for w in windows(t.schedule)]) * len(windows(t.schedule)))
 
 
-@pytest.mark.parametrize("controller", ["dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold"])
+@pytest.mark.parametrize(
+    "controller", ["dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "gain_scheduled", "hold"]
+)
 def test_nothing_beats_the_oracle_on_the_training_model_and_laws_of_a_true_model_reach_it(controller):
     """From one and the same OD. Over a schedule a limit cycle may enter a step from a luckier side.
 

@@ -16,7 +16,14 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Accounts, Array, Controller, Explains, Watches
-from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.laws.density.baselines import (
+    GainScheduled,
+    GainScheduledConfig,
+    Hold,
+    HoldConfig,
+    Threshold,
+    ThresholdConfig,
+)
 from experiments.laws.density.learned import LearnedController, settings
 from experiments.laws.density.mpc import MpcConfig
 from experiments.laws.density.pso import SwarmConfig
@@ -29,6 +36,7 @@ KINDS = tuple(registry.KINDS[registry.DENSITY])
 GIVEN = {
     "mpc": MpcConfig(swarm=SwarmConfig(particles=6, iterations=8)),
     "threshold": ThresholdConfig(hysteresis=0.02),
+    "gain_scheduled": GainScheduledConfig(gain=(0.2, 0.7)),
     "hold": HoldConfig(rate=0.007),
 }
 N = 6
@@ -168,6 +176,31 @@ def test_a_constant_rate_is_the_one_that_is_asked_for_else_that_of_the_model(con
     hold = Hold(config, EnvConfig(mu=0.02, tau=0.45))
     hold.reset(3)
     np.testing.assert_allclose(hold.act(np.ones(3), np.ones(3), np.zeros(3), np.ones(3, dtype=bool)), rate)
+
+
+def test_a_gain_schedule_by_hand() -> None:
+    """At 33 degC mu is 0.02 + 3/7 0.0175 = 0.0275 and K 0.25 + 3/7 0.35 = 0.4; 25 and 41 degC are outside of the table.
+
+    The fourth vial never has a temperature; in the second sample that of the first vial is missing, and the
+    third vial has no valid reading, so its temperature does not count.
+    """
+    config = GainScheduledConfig(temperatures=(30.0, 37.0), mu=(0.02, 0.0375), gain=(0.25, 0.6))
+    law, yes = GainScheduled(config, EnvConfig(tau=0.45, control_min=2.0)), np.ones(4, dtype=bool)
+    law.reset(4)
+    od, setpoint = 0.5 * np.exp([0.02, 0.04, 0.01, -0.03]), np.full(4, 0.5)
+    law.watch(od, np.array([33.0, 25.0, 41.0, np.nan]), np.zeros(4), yes)
+    rate = law.act(od, setpoint, np.zeros(4), yes)
+    np.testing.assert_allclose(rate, 0.45 * np.array([0.0275 + 0.004, 0.02 + 0.005, 0.0375 + 0.003, 0.0375 - 0.009]))
+    law.watch(od, np.array([np.nan, 37.0, 30.0, np.nan]), np.full(4, 2.0), np.array([True, True, False, True]))
+    rate = law.act(setpoint * np.exp([-0.03, 0.0, 0.01, -0.3]), setpoint, np.full(4, 2.0), yes)
+    np.testing.assert_allclose(rate, 0.45 * np.array([0.0275 - 0.006, 0.0375, 0.0375 + 0.003, 0.0]))
+
+
+def test_the_table_of_a_gain_schedule_rises_and_is_full() -> None:
+    with pytest.raises(ValueError, match=r"controller\.temperatures"):
+        GainScheduledConfig(temperatures=(37.0, 30.0))
+    with pytest.raises(ValueError, match=r"controller\.gain"):
+        GainScheduledConfig(gain=(0.5,))
 
 
 def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:

@@ -30,7 +30,7 @@ from tests.hardware.emulator_lab import quiet
 pytestmark = pytest.mark.numeric
 
 NAMES = ("M0", "M1", "M2")
-KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold", "inverse ekf", "dqn ekf")
+KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold", "gain_scheduled", "inverse ekf", "dqn ekf")
 SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5, announce_min=30.0)
 LENGTH, CUT = 44, 26
 HOLD = Scenario((0.5,), (600.0,), (37.0,))

@@ -1,14 +1,16 @@
-"""The simple baselines: a classic threshold turbidostat and a constant rate."""
+"""Simple baselines: a threshold turbidostat, a gain-scheduled proportional controller and a constant rate."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import setting
+from conf.schema import require, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-__all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
+__all__ = ["GainScheduled", "GainScheduledConfig", "Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
+
+LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this one: it has a logarithm
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,64 @@ class Threshold:
         stay = self._on & (od > setpoint - self.config.hysteresis)
         self._on = np.where(now, (od > setpoint) | stay, self._on)
         return np.where(self._on, self.config.rate, 0.0)
+
+
+@dataclass(frozen=True)
+class GainScheduledConfig(ControllerConfig):
+    """The table: growth rate and proportional gain at each temperature. By default mu falls as in the paper."""
+
+    kind: str = setting("gain_scheduled", "which controller")
+    temperatures: tuple[float, ...] = setting((30.0, 37.0), "of the table, rising", "degC", within=(0, 60), some=True)
+    mu: tuple[float, ...] = setting((0.027, 0.03), "growth rate at each temperature", "1/min", within=(0, 0.1))
+    gain: tuple[float, ...] = setting(
+        (0.5, 0.5), "part of ln(x/r) to remove in one control period, at each temperature", within=(0, 2)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        degc, rising = self.temperatures, sorted(set(self.temperatures))
+        require(list(degc) == rising, "controller.temperatures", degc, "rising values, each one once")
+        for name in ("mu", "gain"):
+            column = getattr(self, name)
+            require(len(column) == len(degc), f"controller.{name}", column, f"{len(degc)} values, as temperatures")
+
+
+class GainScheduled:
+    """Proportional control with feed-forward, both looked up by the temperature of the vial: gain scheduling.
+
+      u = clip(tau (mu(T) + K(T) ln(x/r) / h), 0, u_max)
+
+    mu(T) (1/min) and K(T) (dimensionless) come from the table, linear between its entries and constant beyond them; h
+    is the control period (min), u is in mL/s, shape (N,). If mu(T) is true, ln(x/r) shrinks by 1 - K a period. In ln x
+    the plant is an integrator at each temperature, so the default K is the same for all of them. T is the last known
+    temperature; before one is known, the last of the table. Source: gain scheduling as in Rugh and Shamma 2000,
+    Automatica 36:1401; the paper's introduction names such controllers.
+
+    Args: config: the table; model: tau, control period and largest pump rate.
+    """
+
+    remembers = ("degc", "rate")
+
+    def __init__(self, config: GainScheduledConfig, model: EnvConfig) -> None:
+        self.config, self.model = config, model
+        self.reset(1)
+
+    def reset(self, n: int) -> None:
+        """See `Controller.reset`."""
+        self._degc, self._rate = np.full(n, self.config.temperatures[-1]), np.zeros(n)
+
+    def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """See `Watches.watch`."""
+        self._degc = np.where(rows & np.isfinite(temperature), temperature, self._degc)
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """See `Controller.act`."""
+        now, table = usable(od, rows), self.config
+        mu, gain = (np.interp(self._degc, table.temperatures, column) for column in (table.mu, table.gain))
+        z = np.log(np.maximum(np.where(now, od, 1.0), LOWEST_OD) / np.maximum(setpoint, LOWEST_OD))
+        wanted = self.model.tau * (mu + gain * z / self.model.control_min)
+        self._rate = np.where(now, np.clip(wanted, 0.0, self.model.max_pump_rate), self._rate)
+        return self._rate.copy()
 
 
 @dataclass(frozen=True)
