@@ -12,21 +12,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from hardware.pioreactor.config import vial_ml
-from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
-from hardware.pioreactor.pumps import (
-    ALT,
-    LATE_ML,
-    MEDIA,
-    NAMES,
-    OURS,
-    SETTLE_S,
-    SPARE,
-    STEP_S,
-    WASTE,
-    Moved,
-    Pumps,
-    Request,
-)
+from hardware.pioreactor.mailbox import ALT, DOSING_JOBS, MEDIA, NAMES, PUMPS, SPARE, WASTE, Event
+from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
 from hardware.stations import Plan
 from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given, feeds_by

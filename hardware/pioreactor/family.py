@@ -15,8 +15,8 @@ from hardware.link.open import DeviceLock
 from hardware.logbook import Log, no_log
 from hardware.pioreactor.config import FULL_ML, PioreactorConfig, vial_ml
 from hardware.pioreactor.doses import replay
+from hardware.pioreactor.mailbox import SPARE
 from hardware.pioreactor.preflight import preflight
-from hardware.pioreactor.pumps import SPARE
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.reactor import Array, Reactor, left_off
 

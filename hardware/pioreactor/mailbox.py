@@ -15,12 +15,14 @@ from hardware.clock import Clock
 from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
 
-__all__ = ["AUTOMATIONS", "CHANNELS", "DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
+__all__ = ["CHANNELS", "DOSING_JOBS", "NAMES", "PUMPS", "SPARE", "Cluster", "Event", "Mailbox", "Pin", "Reading"]
 
 KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
 MOST_ML = 100.0  # no event tells more: half a second of a pump, or what a pump gave that stood still
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
-PUMPS = ("add_media", "add_alt_media", "remove_waste")  # jobs, in the order of config.pump_pins
+PUMPS = MEDIA, ALT, WASTE = "add_media", "add_alt_media", "remove_waste"  # jobs, in the order of config.pump_pins
+NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
+SPARE = 3  # number of the alt-media pump
 AUTOMATIONS = ("circulate_media", "circulate_alt_media", "pumps", "dosing_automation")  # drive several pumps
 DOSING_JOBS = (*PUMPS, *AUTOMATIONS)
 LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")

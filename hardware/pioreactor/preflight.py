@@ -8,8 +8,8 @@ from hardware.clock import RealClock
 from hardware.errors import ReactorError
 from hardware.family import Check
 from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS
-from hardware.pioreactor.pumps import NAMES, STEP_S, Barrier, driven
+from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS, NAMES
+from hardware.pioreactor.pumps import STEP_S, Barrier
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import UNHEARD, PioreactorStation
 from hardware.pioreactor.versions import TESTED, facts
@@ -47,7 +47,7 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
     yield Check(f"{name} version", version in TESTED, version, f"tried with {', '.join(TESTED)}{asked}", required=False)
     yield (experiment := _experiment(name, config.experiment, unit.leader))
     calibrations = web.get("/active_calibrations")
-    names = [NAMES[job] for job in driven(config)]
+    names = [NAMES[job] for job in station.doses.pumps.jobs]
     for pump in (f"{name}_pump" for name in names):
         try:
             yield Check(f"{name} {pump}", True, f"{flow(calibrations, pump):.3f} mL/s at its calibrated duty")

@@ -13,36 +13,16 @@ from typing import Any, NamedTuple, TypeVar
 
 from hardware.clock import Clock
 from hardware.errors import LinkError, ReactorError
-from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import PUMPS, Event, Pin
+from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Event, Pin
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
 from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = [
-    "ALT",
-    "LATE_ML",
-    "MEDIA",
-    "NAMES",
-    "OURS",
-    "SPARE",
-    "WASTE",
-    "Moved",
-    "Pumps",
-    "Request",
-    "Seen",
-    "Steps",
-    "boot_of",
-    "driven",
-    "is_off",
-]
+__all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "boot_of", "is_off"]
 
 T = TypeVar("T")
 
-MEDIA, ALT, WASTE = PUMPS
-NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
-SPARE = 3  # number of the alt-media pump
 OURS = "turbidostat/"
 STEP_S = 0.1
 SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
@@ -133,11 +113,6 @@ class Barrier:
         return self._passed
 
 
-def driven(config: PioreactorConfig) -> tuple[str, ...]:
-    """Return the pump jobs that a run drives."""
-    return PUMPS if config.alt_media else (MEDIA, WASTE)
-
-
 def boot_of(rows: list[dict[str, Any]]) -> str:
     """When a unit was started, by its list of running jobs; "" where that does not say it."""
     return next((str(row.get("started_at", "")) for row in rows if row["job_name"] == "monitor"), "")
@@ -158,7 +133,7 @@ class Pumps:
     def __init__(self, unit: Unit) -> None:
         self.unit, self.web, self.mqtt, self.box = unit, unit.web, unit.mqtt, unit.box
         self.config, self.clock, self.book = unit.config, unit.real, unit.book
-        self.jobs = driven(unit.config)
+        self.jobs = PUMPS if unit.config.alt_media else (MEDIA, WASTE)
         self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # about what the vendor's pumps give, until it was read
         self.reported: dict[tuple[str, str], float] = {}
         self.counted: dict[tuple[str, str], float] = {}

@@ -21,7 +21,7 @@ from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, UnitConfig
 from hardware.pioreactor.doses import replay
-from hardware.pioreactor.pumps import MEDIA
+from hardware.pioreactor.mailbox import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.reactor import Command

@@ -432,7 +432,8 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
     web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}
     web.settings["od_reading.config"] = {"ref_normalization": "unity"}
-    station = SimpleNamespace(name="pio02", unit=unit)
+    doses = SimpleNamespace(pumps=SimpleNamespace(jobs=("add_media", "remove_waste")))
+    station: Any = SimpleNamespace(name="pio02", unit=unit, doses=doses)
     found = list(_unit(station, SimpleNamespace(config=config, mqtt=mqtt)))  # type: ignore[arg-type]
     checks = {check.name.removeprefix("pio02 "): check for check in found}
     assert {name for name, check in checks.items() if not check.ok and check.required} == {
