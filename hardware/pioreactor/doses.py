@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from hardware.pioreactor.config import vial_ml
-from hardware.pioreactor.mailbox import ALT, DOSING_JOBS, MEDIA, NAMES, PUMPS, SPARE, WASTE, Event
+from hardware.pioreactor.mailbox import ALT, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
 from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
 from hardware.stations import Plan
 from hardware.storage import history as history_of
@@ -143,7 +143,7 @@ class Doses:
             self._due = self._clock.now() + next(self._course)
         except StopIteration:
             self._course, self.ended_s = None, self._clock.now()
-            self._ran_s = {job: self.pumps.pin(job).ran_s for job in PUMPS}
+            self._ran_s = {job: self.pumps.pins[job].ran_s for job in PUMPS}
             self._settle_strange()
 
     def take(self, events: list[Event]) -> None:
@@ -161,7 +161,7 @@ class Doses:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
-        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (self.pumps.halted or self._ran_on):
+        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (WASTE in self.pumps.barred or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
 
@@ -174,12 +174,12 @@ class Doses:
             media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, plan.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
                 now, ago_s = self._clock.now(), pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
-                pin = pumps.pin(self._job)
+                pin = pumps.pins[self._job]
                 found, there = Request(self._job, 0.0, dose, now, pin.ran_s), pin.on or pumps.box.live(self._job)
-                asked = replace(found, ml=asked_ml, asked_s=now - ago_s, task=history.task)
+                asked = found._replace(ml=asked_ml, asked_s=now - ago_s, task=history.task)
                 seen = yield from pumps.follow(asked) if there else pumps.end(found)
                 end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
-                media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
+                media = seen._replace(low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
         self._conclude(plan, dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
@@ -189,14 +189,10 @@ class Doses:
             if moved.end:
                 self._book.tell(f"{NAMES[job]}: {moved.end}")
         taken_ml, end = self._taken_ml, media.end or waste.end
-        row = Ending(on_s, media.high, taken_ml + waste.low, pump=self._number(), feed_low_ml=media.low).row()
+        row = Ending(on_s, media.high, taken_ml + waste.low, pump=NUMBERS[self._job], feed_low_ml=media.low).row()
         self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=end)
         self._ran_on = self._ran_on or media.high > plan.feed_ml + LATE_ML
         self._fed(media.high, media.low, waste.low)
-
-    def _number(self, job: str = "") -> int:
-        """Return the number of a spare pump, 0 for the feed. Args: job: "" for that of the last dose."""
-        return SPARE * ((job or self._job) == ALT)
 
     def _fed(self, high_ml: float, low_ml: float, taken_ml: float = 0.0) -> None:
         """Count what this dose fed up to now, and what was taken since; little is booked once it is much."""
@@ -206,7 +202,7 @@ class Doses:
         rest_ml = self._now_ml - self._told_ml
         if np.abs(rest_ml).max() > LATE_ML:
             more, less, rise = rest_ml.tolist()
-            self.extra.append(Given(self._book.elapsed(), more, less, more - rise, self._number()))
+            self.extra.append(Given(self._book.elapsed(), more, less, more - rise, NUMBERS[self._job]))
             self._told_ml = self._now_ml
 
     def _drained(self, course: Iterator[float], plan: Plan, name: str) -> Iterator[float]:
@@ -224,7 +220,7 @@ class Doses:
                 self._fed(max(pumps.flowed_ml, plan.feed_ml, self._now_ml[0] - self._base_ml[0]), 0.0)
             twice = self._config.waste_factor
             wanted_ml = twice * self._now_ml[2] if over else 0.5 * (twice * pumps.flowed_ml - self._taken_ml)
-            due = wanted_ml > (LATE_ML if over else 0.5 * DRAIN_ML * self._ran_on) and not pumps.halted
+            due = wanted_ml > (LATE_ML if over else 0.5 * DRAIN_ML * self._ran_on) and WASTE not in pumps.barred
             if portion is None and left and due and (self._ran_on if over else pumps.runs_on):
                 wanted_ml, self._ran_on, left = max(wanted_ml, DRAIN_ML * (not over)), True, left - over
                 portion, number = self._portion(wanted_ml, f"{name}/drain{number}"), number + 1
@@ -252,7 +248,7 @@ class Doses:
 
     def _silence(self, job: str, name: str) -> Iterator[float]:
         """End a pump that runs without a job, or whose job was killed, and record what it moved."""
-        pin = self.pumps.pin(job)
+        pin = self.pumps.pins[job]
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
@@ -268,9 +264,9 @@ class Doses:
 
         What the waste pump took meanwhile is booked with the media: its event may have come, and counted, before.
         """
-        beside_ml = (self.pumps.pin(WASTE).ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
+        beside_ml = (self.pumps.pins[WASTE].ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
         for job in self.pumps.jobs:
-            pin, now = self.pumps.pin(job), self._clock.now()
+            pin, now = self.pumps.pins[job], self._clock.now()
             if self.pumps.odd(job) or not (pin.on or self.pumps.box.driven(job) or now < pin.off_s + SETTLE_S):
                 ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
                 self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
@@ -290,8 +286,9 @@ class Doses:
             self._strange_ml[job] += over
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
-                continue
-            self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
+            else:
+                who = "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}"
+                self._theirs(job, over, who)
 
     def _theirs(self, job: str, ml: float, who: str, beside_ml: float = 0.0) -> None:
         self.foreign = f"{job} of {ml:.2f} mL more without our command ({who})"
@@ -301,7 +298,7 @@ class Doses:
         """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
         fed = job != WASTE
         waste_ml = beside_ml if fed else high_ml
-        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, waste_ml, self._number(job))
+        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, waste_ml, NUMBERS[job])
         self.extra.append(given)
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
         self._book.log("given", **given.row(why))

@@ -23,6 +23,7 @@ LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cle
 PUMPS = MEDIA, ALT, WASTE = "add_media", "add_alt_media", "remove_waste"  # jobs, in the order of config.pump_pins
 NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
 SPARE = 3  # number of the alt-media pump
+NUMBERS = {MEDIA: 0, ALT: SPARE, WASTE: 0}  # of spare pumps, as records have them
 AUTOMATIONS = ("circulate_media", "circulate_alt_media", "pumps", "dosing_automation")  # drive several pumps
 DOSING_JOBS = (*PUMPS, *AUTOMATIONS)
 LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
@@ -102,9 +103,10 @@ class Mailbox:
 
     A retained message of another experiment is of no time that is known, and left out.
 
-    Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; pins;
-      states, of each job by experiment; temperature, target, of the thermostat, degC; stir_duty, %; heard_s, when the
-      unit last said anything; dc_s, when it last told its pins; complaint, why its reader took no reading, by its log.
+    Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; jobs,
+      pin number of each pump's job; pins, what is known of each; states, of each job by experiment; temperature,
+      target, of the thermostat, degC; stir_duty, %; heard_s, when the unit last said anything; dc_s, when it last told
+      its pins; complaint, why its reader took no reading, by its log.
     """
 
     def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
@@ -116,7 +118,7 @@ class Mailbox:
         self.ignored: list[str] = []
         self._heard = deque[bytes](maxlen=100)
         self.jobs = dict(zip(PUMPS, config.pump_pins, strict=True))
-        self.pins = {pin: Pin() for pin in config.pump_pins}
+        self.pins = {job: Pin() for job in PUMPS}
         self.states: dict[tuple[str, str], State] = {}
         self.temperature = self.target = self.stir_duty = math.nan
         self.heard_s = self.dc_s = -math.inf
@@ -152,7 +154,7 @@ class Mailbox:
             for job, number in self.jobs.items():
                 word = LIVE[0] if self.driven(job) else self.state(job).word
                 on = duty.get(number, 0.0) > 0.0
-                self.pins[number].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
+                self.pins[job].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
             self.dc_s = max(self.dc_s, at)
         elif rest == "dosing_events" and not retained and payload not in self._heard:  # a bridge brings one twice
             e = json.loads(payload)
@@ -164,7 +166,7 @@ class Mailbox:
                 raise ValueError(f"{event.ml:g} mL")
             self.events.append(event)
             if event.pump in self.jobs and event.ml > 0.0 and self.live(event.pump):
-                pin = self.pins[self.jobs[event.pump]]
+                pin = self.pins[event.pump]
                 pin.event_s = min(pin.event_s, now)
         elif rest == "od_reading/ods" and mine and payload:
             self._reading(json.loads(payload), now, retained)
@@ -185,7 +187,7 @@ class Mailbox:
         self.states[experiment, job] = State(word, max(known.at, at) if word == known.word else at)
         if at == -math.inf or job not in self.jobs:
             return
-        pin = self.pins[self.jobs[job]]
+        pin = self.pins[job]
         if word == "init":
             pin.inits.append(at)
         if word == "init" or (word in LIVE and known.word not in LIVE):
@@ -234,9 +236,9 @@ class Mailbox:
         """Whether a job is there that drives a pump: its own, or one that drives several."""
         return any(map(self.live, (job, *AUTOMATIONS)))
 
-    def on(self) -> list[int]:
-        """Pins that run by what the unit said last."""
-        return [number for number, pin in self.pins.items() if pin.on]
+    def on(self) -> list[str]:
+        """Jobs whose pumps run by what the unit said last."""
+        return [job for job, pin in self.pins.items() if pin.on]
 
 
 def _number(said: Any) -> float:

@@ -8,13 +8,12 @@ Times here are real seconds.
 import math
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 from hardware.clock import Clock
 from hardware.errors import LinkError, ReactorError
 from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Event, Pin
+from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Event
 from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
 from hardware.pioreactor.web import NotHeard, Web
@@ -43,8 +42,7 @@ Steps = Generator[float, None, T]
 """A course that yields what to wait, s, and returns T."""
 
 
-@dataclass(frozen=True)
-class Moved:
+class Moved(NamedTuple):
     """What a pump moved, mL, at least and at most; end, in words, "" as asked."""
 
     low: float = 0.0
@@ -52,8 +50,7 @@ class Moved:
     end: str = ""
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """A run of a pump that was asked for (ml), or found (0): its id, when that was, its pin's time then, the answer."""
 
     job: str
@@ -125,20 +122,19 @@ class Pumps:
       only ends with its pin off; flow_ml_s, by the active calibrations; reported, mL by job and source of the events;
       counted, mL of them that whoever asked for them books, inf while they are under way; facts, of the unit's version;
       boot, when it was started; proven, when pumps were ended here; trouble, why no dose may be given, "" if one may;
-      cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for somebody
-      or something else; flowed_ml, the most that a media pump gave up to now that is not proven off, and runs_on,
-      whether it is to be drained.
+      barred, jobs that are to end; waits, whether what is under way waits for somebody or something else; flowed_ml,
+      the most that a media pump gave up to now that is not proven off, and runs_on, whether it is to be drained.
     """
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.web, self.mqtt, self.box = unit, unit.web, unit.mqtt, unit.box
-        self.config, self.clock, self.book = unit.config, unit.real, unit.book
+        self.config, self.clock, self.book, self.pins = unit.config, unit.real, unit.book, unit.box.pins
         self.jobs = PUMPS if unit.config.alt_media else (MEDIA, WASTE)
         self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # about what the vendor's pumps give, until it was read
         self.reported: dict[tuple[str, str], float] = {}
         self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
-        self.trouble, self.cut, self.halted, self.waits = "", False, False, False
+        self.trouble, self.barred, self.waits = "", tuple[str, ...](), False
         self.flowed_ml, self.runs_on, self._untold = 0.0, False, 0
         self.proven: dict[str, float] = {}
         self._calls = Calls(self.web, self.clock)
@@ -150,17 +146,13 @@ class Pumps:
         key = event.pump, event.source
         self.reported[key] = max(self.reported.get(key, 0.0) + event.ml, 0.0)
 
-    def pin(self, job: str) -> Pin:
-        """Return the pin that a job drives."""
-        return self.box.pins[self.box.jobs[job]]
-
     def lost(self, job: str) -> bool:
         """Whether a job ended without a word, or stands still: its process was killed, frozen, or lost the broker."""
         return self.box.state(job).word == "lost"
 
     def odd(self, job: str) -> bool:
         """Whether a pump has to be ended: it runs without a job, or its job was lost and it is not proven off since."""
-        pin, new = self.pin(job), self.box.state(job).at > self.proven.get(job, -math.inf) or job not in self.proven
+        pin, new = self.pins[job], self.box.state(job).at > self.proven.get(job, -math.inf) or job not in self.proven
         runs_on = pin.on and not self.box.driven(job) and self.clock.now() > max(pin.on_s, pin.ended_s) + SETTLE_S
         return runs_on or (self.lost(job) and new)
 
@@ -180,7 +172,7 @@ class Pumps:
 
     def told_on(self, job: str) -> bool:
         """Whether the unit tells that a pump is on, since the broker is there, and not because of a short run."""
-        pin, broke_s, before_s = self.pin(job), self.mqtt.broke_s, self.clock.now() - SETTLE_S
+        pin, broke_s, before_s = self.pins[job], self.mqtt.broke_s, self.clock.now() - SETTLE_S
         return pin.on and pin.on_s < before_s and (broke_s <= pin.on_s or broke_s < self.box.dc_s < before_s)
 
     def ask_pins(self) -> None:
@@ -212,11 +204,11 @@ class Pumps:
                 raise LinkError("no MQTT broker, so nobody would follow it")
         except ReactorError as error:
             return Moved(end=f"not given, the next sample is dosed: {error}")
-        request = Request(job, round(ml, 4), dose, self.clock.now(), self.pin(job).ran_s)
+        request = Request(job, round(ml, 4), dose, self.clock.now(), self.pins[job].ran_s)
         self.counted[job, dose] = math.inf
         try:
             task = yield from self.answer(self.web.run, job, {"ml": request.ml, "source-of-event": dose})
-            request = replace(request, task=task)
+            request = request._replace(task=task)
             self.book.log("task", id=dose, job=job, task=request.task)
         except NotHeard as error:
             self.counted[job, dose] = 0.0
@@ -234,14 +226,13 @@ class Pumps:
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
         late = self.clock.now() + request.ml / self.flow_ml_s[job] + OVERRUN_S
         while not self._is_over(request):
-            unwanted = self.halted or (self.cut and job != WASTE)
-            if unwanted or self.odd(job) or self.broke(request) or self.clock.now() > late:
+            if job in self.barred or self.odd(job) or self.broke(request) or self.clock.now() > late:
                 return (yield from self.end(request))
             if job != WASTE and (gave_ml := self._beyond(request)):
                 self.flowed_ml, self.runs_on = gave_ml, True
             yield STEP_S
         self.runs_on = False
-        self._untold = 0 if self.pin(job).on_s >= request.asked_s else self._untold + 1
+        self._untold = 0 if self.pins[job].on_s >= request.asked_s else self._untold + 1
         if self._untold > UNTOLD:
             self.box.dc_s = -math.inf  # until the unit tells its pins again
         return self._moved(request)
@@ -251,7 +242,7 @@ class Pumps:
 
         A unit that lost its power says nothing; one that has it is asked.
         """
-        pin, flow, now = self.pin(request.job), self.flow_ml_s[request.job], self.clock.now()
+        pin, flow, now = self.pins[request.job], self.flow_ml_s[request.job], self.clock.now()
         on_s = max(pin.on_s, request.asked_s)
         end_s = on_s + request.ml / flow
         if not pin.on or now < end_s + PAST_S:
@@ -271,7 +262,7 @@ class Pumps:
         never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
         fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
         while not (
-            why or self.said(request) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked_s
+            why or self.said(request) > 0.0 or self.pins[job].on or self.pins[job].on_s >= asked_s
             or (self.lost(job) and self.box.state(job).at >= asked_s)
         ):  # fmt: skip
             now, state, taken = self.clock.now(), self.box.state(job), None
@@ -292,7 +283,7 @@ class Pumps:
                 why = f"accepted and not carried out: {self.locks}"
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
-            if (self.halted or (self.cut and job != WASTE)) and calls.due("stop", 1.0):  # heard once the job listens
+            if job in self.barred and calls.due("stop", 1.0):  # heard once the job listens
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late:
@@ -303,13 +294,13 @@ class Pumps:
 
     def last_word(self, request: Request) -> str:
         """Return what the job of a run last said of itself; "" is unknown: two processes share a topic, or it broke."""
-        pin, state = self.pin(request.job), self.box.state(request.job)
+        pin, state = self.pins[request.job], self.box.state(request.job)
         alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
         return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
 
     def _is_over(self, request: Request) -> bool:
         """Whether a job has said that it ended, its pin stands still, and its last event is there or will not come."""
-        state, pin, asked_s = self.box.state(request.job), self.pin(request.job), request.asked_s
+        state, pin, asked_s = self.box.state(request.job), self.pins[request.job], request.asked_s
         told = pin.on_s >= asked_s and state.word == "disconnected" and state.at >= asked_s  # whoever's word that was
         ended = (told or self.last_word(request) == "disconnected") and not pin.on
         return ended and (self.said(request) >= request.ml - 1e-6 or self.clock.now() > state.at + SETTLE_S)
@@ -318,7 +309,7 @@ class Pumps:
         """Return what a job that ended by itself gave, by its events and by how long its pin was on."""
         flow, ml, said_ml, end = self.flow_ml_s[request.job], request.ml, self.said(request), ""
         low = high = said_ml
-        ran_ml = (self.pin(request.job).ran_s - request.ran_s) * flow
+        ran_ml = (self.pins[request.job].ran_s - request.ran_s) * flow
         if said_ml < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
             slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * flow
             low, high = max(min(said_ml, ran_ml or said_ml) - slack, 0.0), min(max(said_ml, ran_ml) + slack, ml)
@@ -332,7 +323,7 @@ class Pumps:
 
         What only a hand can do is said; once it was done, what is tried here ends the pump.
         """
-        job, ending, pin = request.job, ForcedEnd(self, request), self.pin(request.job)
+        job, ending, pin = request.job, ForcedEnd(self, request), self.pins[request.job]
         while math.isnan(off_s := ending.off_s()):
             ending.act()
             late = (now := self.clock.now()) > ending.began + OVERRUN_S
@@ -392,7 +383,7 @@ class ForcedEnd:
     def __init__(self, pumps: Pumps, request: Request) -> None:
         self._p, self._request, self._job, self._since = pumps, request, request.job, request.asked_s
         self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
-        told_s = pumps.pin(request.job).event_s
+        told_s = pumps.pins[request.job].event_s
         self._from_s = max(request.asked_s, told_s if told_s < math.inf else -math.inf)
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
@@ -421,14 +412,14 @@ class ForcedEnd:
             self._short = None
         may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
         may_run = may_run and p.mqtt.connected and self._short is None  # what it tells, else it runs unseen
-        soon = not (p.box.live(job) or p.pin(job).on or self._request.ml > 0.0)
+        soon = not (p.box.live(job) or p.pins[job].on or self._request.ml > 0.0)
         if may_run and (soon or passed > 5.0) and self._barrier.passed() and calls.due("short", 2.0):
             self._short_s = min(self._short_s, p.clock.now())
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
     def _look(self) -> Seen:
         """Return what is known now."""
-        p, pin, state = self._p, self._p.pin(self._job), self._p.box.state(self._job)
+        p, pin, state = self._p, self._p.pins[self._job], self._p.box.state(self._job)
         self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
         if p.clock.now() > p.box.heard_s + QUIET_S:
@@ -454,7 +445,7 @@ class ForcedEnd:
 
     def off_s(self) -> float:
         """When the pump was off at the latest, nan while that is not proven."""
-        pin, now = self._p.pin(self._job), self._p.clock.now()
+        pin, now = self._p.pins[self._job], self._p.clock.now()
         if not is_off(self._look()):
             return math.nan
         if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
@@ -466,7 +457,7 @@ class ForcedEnd:
     @property
     def _untold(self) -> bool:
         """Whether the pin of a dose that had to be ended was not said to be on: its job switches first."""
-        heard = self._since <= self._p.pin(self._job).on_s < self._short_s
+        heard = self._since <= self._p.pins[self._job].on_s < self._short_s
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
@@ -474,7 +465,7 @@ class ForcedEnd:
 
         0 for a pump whose bottle is empty by now.
         """
-        p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
+        p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
         flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
@@ -482,7 +473,7 @@ class ForcedEnd:
 
     def moved(self, off_s: float) -> Moved:
         """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
-        p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
+        p, pin, flow = self._p, self._p.pins[self._job], self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
         longest = max(min(off_s, self._still_s) - self._from_s, 0.0) * flow
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)

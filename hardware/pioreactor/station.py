@@ -11,7 +11,7 @@ from contextlib import suppress
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, UnitHistory
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
-from hardware.pioreactor.mailbox import AUTOMATIONS, PUMPS
+from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Barrier, Calls, Pumps, boot_of
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.unit import Unit
@@ -51,7 +51,7 @@ class PioreactorStation:
         self.given_up = self.heat_is_off = self.up = False
         self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
         self._course: Iterator[float] | None = None
-        self._gone, self._been, self._ended, self._missing = set[str](), set[str](), set[str](), list[str]()
+        self._gone, self._been, self._ended = set[str](), set[str](), set[str]()
         self._asked_s: dict[str, float] = {}
         self._listed = set[str]()
         self._target_sent_s, self._target_sends = math.inf, 0
@@ -127,7 +127,7 @@ class PioreactorStation:
         course = self._course
         if course is not None and next(course, None) is None and self._course is course:
             self._course = None
-        if not self.up and not self._pumps.halted:
+        if not self.up and WASTE not in self._pumps.barred:
             return
         readings, events, ignored = self._box.drain()
         for note in ignored:
@@ -152,7 +152,8 @@ class PioreactorStation:
             self._pumps.ask_pins()
         if math.isinf(self._box.dc_s):
             self._course = self._course or self.hear_pins()
-        self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
+        for job in self._wanted() if self._mqtt.connected else ():
+            self._keep(job)
         self._steer()
 
     def poll(self) -> bool:
@@ -162,20 +163,18 @@ class PioreactorStation:
             return False
         undisturbed_s = self._clock.of_real(self.doses.ended_s) + self._config.mix_s
         dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
-        found = None if dosing else self.sampling.look(self._clock.now(), undisturbed_s)
+        is_new, s = not dosing and self.sampling.look(self._clock.now(), undisturbed_s), self.sampling
         self.book.report(self._wrong())
-        if found is None:
-            return False
-        t, c = self.book.elapsed() - self._clock.now() + found.at, self._box.temperature
-        r = found.number
-        self.book.log("sample", sample_s=round(t, 3), od=found.od, spread=found.spread, readings=r, temperature=c)
-        return True
+        if is_new:
+            t, c = self.book.elapsed() - self._clock.now() + s.at, self._box.temperature
+            self.book.log("sample", sample_s=round(t, 3), od=s.od, spread=s.spread, readings=s.number, temperature=c)
+        return is_new
 
     @property
     def newest(self) -> Newest:
         """Its newest sample."""
-        s = self.sampling.newest
-        return Newest(s.at, s.od, self._box.temperature, s.raw, self.sampling.arrived_s)
+        s = self.sampling
+        return Newest(s.at, s.od, self._box.temperature, s.raw, s.arrived_s)
 
     @property
     def handed_over(self) -> bool:
@@ -185,7 +184,7 @@ class PioreactorStation:
     @property
     def key(self) -> tuple[float, int] | None:
         """Of the newest sample, None before the first."""
-        return (round(self.sampling.newest.at, 3), self.sampling.count) if self.sampling.count else None
+        return (round(self.sampling.at, 3), self.sampling.count) if self.sampling.count else None
 
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
@@ -204,19 +203,17 @@ class PioreactorStation:
             return Fault("mode", f"{theirs[0]} of the vendor's runs", "stop it in the vendor's page; it is counted")
         if self.doses.foreign and not self.handed_over:
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
-        if self._missing:
-            forget, job = self._pumps.facts.forget, self._missing[0]
+        if job := next((job for job in self._wanted() if job in self._gone), ""):
+            forget = self._pumps.facts.forget
             word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
             twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
             again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
-            remedy = f"{again}; a killed job blocks restarts, on the unit: {word}"
+            what, remedy = f"the unit {GONE[job]}", f"{again}; a killed job blocks restarts, on the unit: {word}"
             if job == OD and (said := self._box.complaint):
-                return Fault("stopped", f"the unit {GONE[job]}, its log says: {said}", "do what that says; doses wait")
-            if self._real.now() > self._box.heard_s + SILENT_S:
-                return Fault(
-                    "stopped", f"the unit {GONE[job]}, nor says anything", f"look at its power and network; {again}"
-                )
-            return Fault("stopped", f"the unit {GONE[job]}", remedy)
+                what, remedy = f"{what}, its log says: {said}", "do what that says; doses wait"
+            elif self._real.now() > self._box.heard_s + SILENT_S:
+                what, remedy = f"{what}, nor says anything", f"look at its power and network; {again}"
+            return Fault("stopped", what, remedy)
         if math.isinf(self._box.dc_s):
             return Fault("pump", UNHEARD, "stop and start stirring in the vendor's page, else reboot the unit")
         since_s, why = self._calls.failed.get("rows", (math.inf, ""))
@@ -240,19 +237,17 @@ class PioreactorStation:
         known = state.at > -math.inf or not state.word
         return self._box.live(job) if state.word and known else job in self._listed
 
-    def _is_gone(self, job: str) -> bool:
-        """Whether a job should run and does not; it is asked for again, once if it said itself that it ended."""
+    def _keep(self, job: str) -> None:
+        """Ask for a job again that should run and does not, once if it said itself that it ended."""
         if self._there(job):
             self._gone.discard(job)
             self._been.add(job)
-            return False
-        if self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S:
+        elif self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S:
             self._gone.add(job)
             ended = job != OD and self._box.state(job).word == "disconnected" and job in self._been and not self._astray
             if self._course is None and not (ended and job in self._ended):
                 self._asked_s[job], self._course = self._real.now(), self._again(job)
                 self._ended |= {job} if ended else set()
-        return job in self._gone
 
     def _again(self, job: str) -> Iterator[float]:
         """Start a job anew; one that is there and does nothing is first ended."""
@@ -270,7 +265,7 @@ class PioreactorStation:
             refusal = "the unit regulates itself"
         elif self.book.fault is not None:
             refusal = str(self.book.fault)
-        elif self._clock.now() - self.sampling.newest.at > self.unit.bench.stale_s:
+        elif self._clock.now() - self.sampling.at > self.unit.bench.stale_s:
             refusal = "its sample is stale"
         plan = self.doses.begin(rate, self.key, refusal, pump)
         self.doses.foreign = ""
@@ -303,7 +298,7 @@ class PioreactorStation:
     def end_pumps(self, real_s: float, final: bool = False) -> Iterator[float]:
         """Course: every pump off, verified; a dose is cut, waste only if final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
-        pumps.cut, pumps.halted = True, final
+        pumps.barred = PUMPS if final else (MEDIA, ALT)
         try:
             while (
                 not self._mqtt.connected or self.doses.running or box.on()
@@ -319,7 +314,7 @@ class PioreactorStation:
                 self.go_on()
                 yield STEP_S
         finally:
-            pumps.cut = final
+            pumps.barred = PUMPS if final else ()
 
     def give_up(self) -> Iterator[float]:
         """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `end_pumps`."""

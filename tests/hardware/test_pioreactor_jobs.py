@@ -26,7 +26,7 @@ from hardware.pioreactor.station import UNHEARD
 from hardware.pioreactor.versions import TESTED, facts
 from hardware.pioreactor.web import Web
 from hardware.rig import family as rig
-from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, WASTE_PIN, Lab, World, sampled
+from tests.hardware.pioreactor_lab import UNIT, Lab, World, sampled
 
 
 @pytest.fixture
@@ -330,8 +330,8 @@ def test_nothing_is_dosed_before_the_unit_told_a_pin_that_was_switched(monkeypat
     lab.until(lambda: lab.fault is None, 20.0)
     lab.sample()
     assert lab.dose(0.5) == 0.5
-    lab.until(lambda: lab.station._box.on() == [MEDIA_PIN], 5.0)
-    lab.until(lambda: lab.station._box.on() == [WASTE_PIN], 5.0)
+    lab.until(lambda: lab.station._box.on() == ["add_media"], 5.0)
+    lab.until(lambda: lab.station._box.on() == ["remove_waste"], 5.0)
     lab.wait(5.0)
     assert lab.given() == pytest.approx((0.5, 0.5), abs=0.02)
 

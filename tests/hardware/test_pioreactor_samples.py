@@ -15,7 +15,7 @@ from hardware.clock import VirtualClock
 from hardware.errors import UnfitError
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.family import PioreactorFamily
-from hardware.pioreactor.mailbox import LIVE, LOCKS, WORDS, Cluster, Mailbox, Reading, State
+from hardware.pioreactor.mailbox import LIVE, LOCKS, MEDIA, WASTE, WORDS, Cluster, Mailbox, Reading, State
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.safety.config import RAW_MIN
 from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World, sampled
@@ -71,9 +71,9 @@ def test_what_a_job_said_of_itself_has_its_time_and_what_is_retained_has_none(wo
 def test_a_pin_that_is_retained_as_on_runs_since_nobody_knows_when():
     box = mailbox()
     box.take(f"pioreactor/{UNIT}/{EXPERIMENT}/pwms/dc", b'{"13": 100.0}', True)
-    assert (box.on(), box.pins[13].on_s, box.dc_s) == ([13], -math.inf, -math.inf)
+    assert (box.on(), box.pins[MEDIA].on_s, box.dc_s) == ([MEDIA], -math.inf, -math.inf)
     box.take(f"pioreactor/{UNIT}/{EXPERIMENT}/pwms/dc", b"{}", False)
-    assert (box.on(), box.pins[13].off_s, box.pins[13].ran_s, box.dc_s) == ([], 5.0, 0.0, 5.0)
+    assert (box.on(), box.pins[MEDIA].off_s, box.pins[MEDIA].ran_s, box.dc_s) == ([], 5.0, 0.0, 5.0)
 
 
 @pytest.mark.parametrize("payload", [b"{", b"[]", b'{"timestamp": 1}', b"\xff", b"null", b'{"ods": {"2": {}}}'])
@@ -172,12 +172,11 @@ def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
     sampling = UnitSampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     values = [0.60, 0.61, 0.59, 2.0, 0.60]
     sampling.take([Reading(40.0 + k, v) for k, v in enumerate(values)])
-    sample = sampling.look(45.0, 0.0)
-    assert sample is not None
-    assert sample.number == 5
-    assert sample.od == pytest.approx(2.0 * (0.60 - 0.1))
-    assert sample.spread == pytest.approx(2.0 * 1.4826 * 0.01 / np.sqrt(5.0))
-    assert sample.at == pytest.approx(42.0)
+    assert sampling.look(45.0, 0.0)
+    assert sampling.number == 5
+    assert sampling.od == pytest.approx(2.0 * (0.60 - 0.1))
+    assert sampling.spread == pytest.approx(2.0 * 1.4826 * 0.01 / np.sqrt(5.0))
+    assert sampling.at == pytest.approx(42.0)
 
 
 @pytest.mark.parametrize("late_s", [1, 7])
@@ -256,7 +255,8 @@ def test_two_units_have_their_own_values(monkeypatch):
     (reading,), _, _ = box.drain()
     sampling = UnitSampling(config.of("pio02"), 60.0, 0.0)
     sampling.take([reading, reading])
-    assert sampling.look(6.0, 0.0).od == pytest.approx(2.5 * 0.4)
+    assert sampling.look(6.0, 0.0)
+    assert sampling.od == pytest.approx(2.5 * 0.4)
     config = RigBackendConfig(units={"pio01": UnitConfig(address="http://10.0.0.1/")})
     assert [config.address(name) for name in ("pio01", "pio02")] == ["http://10.0.0.1", "http://pio02.local"]
 
@@ -267,7 +267,8 @@ def test_the_interlock_s_counts_are_those_of_the_photodiode_not_of_the_od(readin
     """Of a reading of a calibration they are unknown, and never those of a sensor that failed."""
     sampling = UnitSampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     sampling.take([Reading(at, reading, calibrated) for at in (1.0, 3.0)])
-    assert sampling.look(4.0, 0.0).raw == pytest.approx(max(raw, RAW_MIN) if calibrated else raw)
+    assert sampling.look(4.0, 0.0)
+    assert sampling.raw == pytest.approx(max(raw, RAW_MIN) if calibrated else raw)
 
 
 def test_readings_of_the_window_count_and_one_alone_is_no_sample():
@@ -275,12 +276,14 @@ def test_readings_of_the_window_count_and_one_alone_is_no_sample():
     sampling = UnitSampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
     sampling.take([Reading(17.9, 9.0)])
     sampling.take([Reading(18.0, 0.5)])
-    assert sampling.look(29.9, 0.0).number == 2
+    assert sampling.look(29.9, 0.0)
+    assert sampling.number == 2
     sampling = UnitSampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
     sampling.take([Reading(17.9, 9.0), Reading(18.0, 0.5)])
-    assert sampling.look(30.0, 0.0) is None
+    assert not sampling.look(30.0, 0.0)
     sampling.take([Reading(30.0, 0.7)])
-    assert (sampling.look(30.0, 0.0).od, sampling.count, sampling.read_s) == (pytest.approx(0.6), 1, 30.0)
+    assert sampling.look(30.0, 0.0)
+    assert (sampling.od, sampling.count, sampling.read_s) == (pytest.approx(0.6), 1, 30.0)
 
 
 def test_what_a_unit_says_of_its_heat_and_its_pumps_is_read_by_its_own_names():
@@ -302,7 +305,7 @@ def test_what_a_unit_says_of_its_heat_and_its_pumps_is_read_by_its_own_names():
     assert (box.jobs, box.dc_s) == ({"add_media": 5, "add_alt_media": 6, "remove_waste": 9}, 7.0)
     box.take(f"{below}remove_waste/$state", b"ready", False)
     box.take(f"{below}pwms/dc", b'{"9": 100.0}', False)
-    assert box.on() == [9]
+    assert box.on() == [WASTE]
 
 
 @pytest.mark.parametrize(("ml", "counts"), [(10.0, True), (-10.0, True), (100.1, False), (-100.1, False)])
