@@ -1,7 +1,7 @@
 """One dose from intent to its end: media, then waste, each a job of the vendor's with our id; never sent twice.
 
-A dose whose fate is not known is never sent again; nothing more is dosed until it is certain that it cannot run any
-more. What it gave is on record with the least and the most, and what was booked otherwise when it began is corrected.
+After one whose fate is not known nothing is dosed until it is certain that it cannot run any more. What a dose gave is
+on record with the least and the most, and what was booked otherwise when it began is corrected.
 """
 
 import math
@@ -149,8 +149,9 @@ class Doses:
     def take(self, events: list[Event]) -> None:
         """Dosing events that arrived; those that are nobody's here are booked after the dose under way."""
         for event in events:
-            self.pumps.take(event)
-            if math.isfinite(self.pumps.counted.get((event.pump, event.source), 0.0)):
+            key = event.pump, event.source
+            self.pumps.reported[key] = max(self.pumps.reported[key] + event.ml, 0.0)  # a correction is negative
+            if math.isfinite(self.pumps.counted[key]):
                 self._strange.append(event)
         if self._course is None:
             self._settle_strange()
@@ -235,7 +236,7 @@ class Doses:
         before_ml, course, over = self._taken_ml, self.pumps.give(WASTE, ml, name), False
         self._book.tell(f"{ml:.1f} mL of waste: the vial is drained of what the media pump gives that runs on")
         while not over:
-            taken_ml = self.pumps.reported.get((WASTE, name), 0.0)
+            taken_ml = self.pumps.reported[WASTE, name]
             try:
                 yield next(course)
             except StopIteration as ended:
@@ -277,7 +278,7 @@ class Doses:
         """Book what was dosed without a command of this run, beyond what was counted already."""
         strange, self._strange = self._strange, []
         for job, source in dict.fromkeys((event.pump, event.source) for event in strange):
-            counted = self.pumps.counted.get((job, source), 0.0)
+            counted = self.pumps.counted[job, source]
             over = self.pumps.reported[job, source] - counted
             ours = source.startswith(self.pumps.ours)  # what is booked of it may be more than was reported
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:

@@ -1,7 +1,4 @@
-"""MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's.
-
-Whatever arrives, the thread lives: what is not understood is left out, counted, and said once.
-"""
+"""MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's."""
 
 import json
 import math
@@ -125,7 +122,7 @@ class Mailbox:
         self.complaint, self._stamp, self._said = "", "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
-        """One message. Raises: nothing."""
+        """Take a message; one that is not understood is left out, and its kind said once. Raises: nothing."""
         experiment, _, rest = topic.removeprefix(self._root).partition("/")
         try:
             with self.lock:
@@ -216,10 +213,9 @@ class Mailbox:
     def drain(self) -> tuple[list[Reading], list[Event], list[str]]:
         """Return readings, events, and what was ignored, since the last call."""
         with self.lock:
-            found = list(self.readings), list(self.events), self.ignored
-            self.readings.clear()
-            self.events.clear()
-            self.ignored = []
+            found = list(self.readings), list(self.events), list(self.ignored)
+            for kind in (self.readings, self.events, self.ignored):
+                kind.clear()
         return found
 
     def state(self, job: str) -> State:

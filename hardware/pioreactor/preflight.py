@@ -9,11 +9,11 @@ from hardware.errors import ReactorError
 from hardware.family import Check
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS, NAMES
-from hardware.pioreactor.pumps import STEP_S, Barrier
+from hardware.pioreactor.pumps import STEP_S
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import UNHEARD, PioreactorStation
 from hardware.pioreactor.versions import TESTED, facts
-from hardware.pioreactor.web import NotHeard, Web
+from hardware.pioreactor.web import Barrier, NotHeard, Web
 
 __all__ = ["preflight"]
 
@@ -80,7 +80,11 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
     remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
     yield _queue(name, web)
-    yield from [_pins(station)] if experiment.ok else ()  # of another one it tells us nothing
+    if experiment.ok:  # of another one it tells us nothing
+        for _ in station.hear_pins():
+            unit.real.sleep(STEP_S)
+        heard, remedy = unit.box.dc_s > -math.inf, f"tried with {', '.join(TESTED)}; look whether stirring runs"
+        yield Check(f"{name} pins", heard, "told when one is switched" if heard else UNHEARD, remedy)
 
 
 def _experiment(name: str, wanted: str, leader: Web) -> Check:
@@ -110,12 +114,3 @@ def _queue(name: str, web: Web) -> Check:
         clock.sleep(STEP_S)
     detail = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
     return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")
-
-
-def _pins(station: PioreactorStation) -> Check:
-    """Whether the unit tells what its pins do."""
-    for _ in station.hear_pins():
-        station.unit.real.sleep(STEP_S)
-    heard = station.unit.box.dc_s > -math.inf
-    told = "told when one is switched" if heard else UNHEARD
-    return Check(f"{station.name} pins", heard, told, f"tried with {', '.join(TESTED)}; look whether stirring runs")

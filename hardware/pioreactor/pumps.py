@@ -6,19 +6,23 @@ Times here are real seconds.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-from hardware.clock import Clock
+from envs.bench import Bench
+from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ReactorError
+from hardware.logbook import Logbook
+from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Event
-from hardware.pioreactor.unit import Unit
+from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Cluster, Mailbox
 from hardware.pioreactor.versions import Facts
-from hardware.pioreactor.web import NotHeard, Web
+from hardware.pioreactor.web import PROBE_S, Barrier, Calls, NotHeard, Web
 
-__all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "boot_of", "is_off"]
+__all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "Unit", "boot_of", "is_off"]
 
 T = TypeVar("T")
 
@@ -27,7 +31,6 @@ STEP_S = 0.1
 SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
 OVERRUN_S = 3.0  # beyond its time a job is given to end by itself
 UNSTARTED_S = 60.0  # that a process may take from the queue to its first word, on a busy unit
-PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused
 QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
 LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
@@ -40,6 +43,37 @@ UNTOLD = 2  # runs in a row of which no pin was told; with one more no pump is f
 
 Steps = Generator[float, None, T]
 """A course that yields what to wait, s, and returns T."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One unit's surroundings.
+
+    name: as in the vendor's page. config: of this unit. bench: period, bottle. volume_ml: of its culture. web, leader,
+    mqtt, box: the ways to it and to its leader. clock: of the run, whose `real` is that of messages and jobs. book:
+    what it reports. run: of this run, part of every dose's id.
+    """
+
+    name: str
+    config: PioreactorConfig
+    bench: Bench
+    volume_ml: float
+    web: Web
+    leader: Web
+    mqtt: Cluster
+    box: Mailbox
+    clock: DeviceClock
+    book: Logbook
+    run: str
+
+    @property
+    def real(self) -> Clock:
+        """Real time: messages, jobs, pins."""
+        return self.clock.real
+
+    def say(self, topic: str, payload: str) -> None:
+        """Publish below our experiment."""
+        self.mqtt.publish(f"pioreactor/{self.name}/{self.config.experiment}/{topic}", payload)
 
 
 class Moved(NamedTuple):
@@ -59,55 +93,6 @@ class Request(NamedTuple):
     asked_s: float
     ran_s: float
     task: str = ""
-
-
-class Calls:
-    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often.
-
-    Attributes: failed, of each kind that was not answered well the last time, since when, and how.
-    """
-
-    def __init__(self, web: Web, clock: Clock) -> None:
-        self._web, self._clock = web, clock
-        self._open: dict[str, Future[Any]] = {}
-        self._next: dict[str, float] = {}
-        self.failed: dict[str, tuple[float, str]] = {}
-
-    def due(self, kind: str, every_s: float) -> bool:
-        """Whether something of this kind is to be done now."""
-        if due := self._clock.now() >= self._next.get(kind, -math.inf):
-            self._next[kind] = self._clock.now() + every_s
-        return due
-
-    def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
-        """Return the answer that came since the last call; None while there is none, and for trouble on the way."""
-        if kind not in self._open and self.due(kind, every_s):
-            self._open[kind] = self._web.ask(what, *given)
-        if kind in self._open and self._open[kind].done():
-            since_s, _ = self.failed.pop(kind, (self._clock.now(), ""))
-            try:
-                return (self._open.pop(kind).result(),)
-            except ReactorError as error:
-                self.failed[kind] = since_s, str(error)
-        return None
-
-
-class Barrier:
-    """Whether nothing older waits in the task queue: a harmless request behind it, made now and then, was taken."""
-
-    def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
-        self._calls, self._web, self._task = Calls(web, clock), web, ""
-        self._clock, self._from_s, self._passed = clock, clock.now() + wait_s, False
-
-    def passed(self) -> bool:
-        """Whether it was, by what was answered until now."""
-        if self._clock.now() < self._from_s or self._passed:
-            return self._passed
-        said = self._calls.ask("result", 0.5, self._web.result, self._task) if self._task else None
-        self._passed = bool(said and said[0] is not None)
-        if made := self._calls.ask("run", PROBE_S, self._web.run, PROBE, {"help": None}):
-            self._task = made[0]
-        return self._passed
 
 
 def boot_of(rows: list[dict[str, Any]]) -> str:
@@ -131,8 +116,8 @@ class Pumps:
         self.config, self.clock, self.book, self.pins = unit.config, unit.real, unit.book, unit.box.pins
         self.jobs = PUMPS if unit.config.alt_media else (MEDIA, WASTE)
         self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # about what the vendor's pumps give, until it was read
-        self.reported: dict[tuple[str, str], float] = {}
-        self.counted: dict[tuple[str, str], float] = {}
+        self.reported = defaultdict[tuple[str, str], float](float)
+        self.counted = defaultdict[tuple[str, str], float](float)
         self.facts, self.boot = Facts(), ""
         self.trouble, self.barred, self.waits = "", tuple[str, ...](), False
         self.flowed_ml, self.runs_on, self._untold = 0.0, False, 0
@@ -140,11 +125,6 @@ class Pumps:
         self._calls = Calls(self.web, self.clock)
         self.ours = f"{OURS}{unit.run}/"
         self.short = f"{self.ours}{unit.name}/off"
-
-    def take(self, event: Event) -> None:
-        """Take a dosing event; a correction is negative, and of what was reported."""
-        key = event.pump, event.source
-        self.reported[key] = max(self.reported.get(key, 0.0) + event.ml, 0.0)
 
     def lost(self, job: str) -> bool:
         """Whether a job ended without a word, or stands still: its process was killed, frozen, or lost the broker."""
@@ -182,7 +162,7 @@ class Pumps:
 
     def said(self, request: Request) -> float:
         """Sum what the events of a run reported so far, mL."""
-        return self.reported.get((request.job, request.dose), 0.0)
+        return self.reported[request.job, request.dose]
 
     def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
         """Wait for a request while the other units go on. Raises: as the request."""
@@ -394,7 +374,7 @@ class ForcedEnd:
 
     def _shorts(self) -> float:
         """Sum what short runs of the pump reported, mL."""
-        return self._p.reported.get((self._job, self._p.short), 0.0)
+        return self._p.reported[self._job, self._p.short]
 
     def act(self) -> None:
         """Ask what is due; a job that is there is given some seconds to end by itself."""

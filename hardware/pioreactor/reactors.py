@@ -11,8 +11,8 @@ from hardware.logbook import Log, Logbook, no_log
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import UnitHistory
 from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.pioreactor.pumps import Unit
 from hardware.pioreactor.station import PioreactorStation
-from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.web import Web
 from hardware.stations import Stations
 
@@ -102,7 +102,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
 
     def _silence(self, stations: Sequence[PioreactorStation]) -> dict[PioreactorStation, ReactorError]:
         """All pumps of these off, what empties a vial too; what could not be verified."""
-        return self._all(stations, lambda station: station.end_pumps(self.config.stop_s, final=True))
+        return self._all(stations, lambda station: station.pumps_off(self.config.stop_s, final=True))
 
     def set_level(self, n: int, level_ml: float) -> None:
         """Put the unit's own ledger, where it keeps one, to a volume, as soon as it answers."""

@@ -12,10 +12,10 @@ from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, UnitHistory
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
-from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Barrier, Calls, Pumps, boot_of
+from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
-from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import facts
+from hardware.pioreactor.web import Barrier, Calls
 from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
 
@@ -181,11 +181,6 @@ class PioreactorStation:
         """Whether the vendor's turbidostat has it."""
         return math.isfinite(self.regulated_od)
 
-    @property
-    def key(self) -> tuple[float, int] | None:
-        """Of the newest sample, None before the first."""
-        return (round(self.sampling.at, 3), self.sampling.count) if self.sampling.count else None
-
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
         if not self._mqtt.connected:
@@ -267,7 +262,8 @@ class PioreactorStation:
             refusal = str(self.book.fault)
         elif self._clock.now() - self.sampling.at > self.unit.bench.stale_s:
             refusal = "its sample is stale"
-        plan = self.doses.begin(rate, self.key, refusal, pump)
+        key = (round(self.sampling.at, 3), self.sampling.count) if self.sampling.count else None
+        plan = self.doses.begin(rate, key, refusal, pump)
         self.doses.foreign = ""
         return plan
 
@@ -291,11 +287,7 @@ class PioreactorStation:
             self._target_sends = 0
             self._listed.discard(HEAT)
 
-    def pumps_off(self) -> Iterator[float]:
-        """Course: every pump off, verified, but one that drains what a media pump gives. Raises: DeviceStateError."""
-        return self.end_pumps(PUMPS_S)
-
-    def end_pumps(self, real_s: float, final: bool = False) -> Iterator[float]:
+    def pumps_off(self, real_s: float = PUMPS_S, final: bool = False) -> Iterator[float]:
         """Course: every pump off, verified; a dose is cut, waste only if final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
         pumps.barred = PUMPS if final else (MEDIA, ALT)
@@ -317,11 +309,11 @@ class PioreactorStation:
             pumps.barred = PUMPS if final else ()
 
     def give_up(self) -> Iterator[float]:
-        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `end_pumps`."""
+        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
         self.given_up, self.regulated_od = True, math.nan
         if self._there(AUTOMATION):
             yield from self._end_job(AUTOMATION)
-        yield from self.end_pumps(self._config.stop_s, final=True)
+        yield from self.pumps_off(self._config.stop_s, final=True)
 
     def heat_off(self) -> Iterator[float]:
         """Course: thermostat ended for the rest of the run. Raises: DeviceStateError."""
@@ -341,7 +333,7 @@ class PioreactorStation:
 
     def regulate(self, setpoint: float) -> Iterator[float]:
         """Course: handed over to the vendor's turbidostat for good once it says so. Raises: ReactorError."""
-        yield from self.end_pumps(self._config.stop_s)
+        yield from self.pumps_off(self._config.stop_s)
         self.regulated_od, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
         try:
             yield from self._start(AUTOMATION)

@@ -1,6 +1,7 @@
 """The vendor's HTTP interface of one unit or leader: what was said, and whether it can have been heard."""
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from http.client import responses
@@ -9,14 +10,16 @@ from urllib.parse import quote
 
 import httpx
 
-from hardware.errors import LinkError, ProtocolError
+from hardware.clock import Clock
+from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.http import fetch
 
-__all__ = ["NotHeard", "Web"]
+__all__ = ["PROBE_S", "Barrier", "Calls", "NotHeard", "Web"]
 
 T = TypeVar("T")
 
 REMEDY = "if that stays, on the unit: sudo systemctl restart pioreactor-web.target"
+PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused
 OVER = ("complete", "succeeded", "failed")  # states of a task that was taken and is over, in whatever version
 
 
@@ -127,3 +130,52 @@ class Web:
         """Idempotent; a request that hangs is left to its time-out."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._client.close()
+
+
+class Calls:
+    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often.
+
+    Attributes: failed, of each kind that was not answered well the last time, since when, and how.
+    """
+
+    def __init__(self, web: Web, clock: Clock) -> None:
+        self._web, self._clock = web, clock
+        self._open: dict[str, Future[Any]] = {}
+        self._next: dict[str, float] = {}
+        self.failed: dict[str, tuple[float, str]] = {}
+
+    def due(self, kind: str, every_s: float) -> bool:
+        """Whether something of this kind is to be done now."""
+        if due := self._clock.now() >= self._next.get(kind, -math.inf):
+            self._next[kind] = self._clock.now() + every_s
+        return due
+
+    def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
+        """Return the answer that came since the last call; None while there is none, and for trouble on the way."""
+        if kind not in self._open and self.due(kind, every_s):
+            self._open[kind] = self._web.ask(what, *given)
+        if kind in self._open and self._open[kind].done():
+            since_s, _ = self.failed.pop(kind, (self._clock.now(), ""))
+            try:
+                return (self._open.pop(kind).result(),)
+            except ReactorError as error:
+                self.failed[kind] = since_s, str(error)
+        return None
+
+
+class Barrier:
+    """Whether nothing older waits in the task queue: a harmless request behind it, made now and then, was taken."""
+
+    def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
+        self._calls, self._web, self._task = Calls(web, clock), web, ""
+        self._clock, self._from_s, self._passed = clock, clock.now() + wait_s, False
+
+    def passed(self) -> bool:
+        """Whether it was, by what was answered until now."""
+        if self._clock.now() < self._from_s or self._passed:
+            return self._passed
+        said = self._calls.ask("result", 0.5, self._web.result, self._task) if self._task else None
+        self._passed = bool(said and said[0] is not None)
+        if made := self._calls.ask("run", PROBE_S, self._web.run, PROBE, {"help": None}):
+            self._task = made[0]
+        return self._passed
