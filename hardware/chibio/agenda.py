@@ -2,13 +2,13 @@
 
 import heapq
 import itertools
-from collections.abc import Iterator
+from collections.abc import Generator
 
 from hardware.clock import Clock
 
 __all__ = ["Agenda", "Task"]
 
-Task = Iterator[float]
+Task = Generator[float, None, None]
 """A generator that does its work in steps; what it yields is the pause in seconds until its next step."""
 
 
@@ -47,6 +47,5 @@ class Agenda:
     def clear(self) -> None:
         """Forget all tasks."""
         for _, _, task in self._queue:
-            if hasattr(task, "close"):
-                task.close()
+            task.close()
         self._queue.clear()

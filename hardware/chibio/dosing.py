@@ -133,11 +133,8 @@ class SupplyConfig:
     def __post_init__(self) -> None:
         check(self, "backend.supply")
         for pump in self.pumps:  # else a dose that it cannot deliver would be owed for ever, in the feed's place
-            key, flow, least = (
-                f"backend.supply.{pump.lower()}_ml_s",
-                self.flow_ml_s(pump),
-                self.calibration(pump).min_dose_ml,
-            )
+            key, flow = f"backend.supply.{pump.lower()}_ml_s", self.flow_ml_s(pump)
+            least = self.calibration(pump).min_dose_ml
             require(flow >= 0.2, key, flow, "0 or 0.2 to 1.5 mL/s")
             require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
 

@@ -63,12 +63,11 @@ class OverflowPumpConfig:
 class OverflowPump:
     """The overflow pump of one reactor: looked at with every read, put right, read back.
 
-    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on; tried,
-      whether it may have been switched on here.
+    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on.
     """
 
     def __init__(self, connection: Connection, config: OverflowPumpConfig, book: Logbook) -> None:
-        self.trouble, self.was_on, self.tried = "", False, False
+        self.trouble, self.was_on = "", False
         self._connection, self._config, self._book = connection, config, book
 
     def keep_on(self, state: DeviceState) -> DeviceState:
@@ -80,7 +79,6 @@ class OverflowPump:
         if not (found := config.wrong(state)):
             self.trouble, self.was_on = "", self.was_on or bool(config.pump)
             return state
-        self.tried = True
         if found != "off" or state.pump_targets[PUMPS.index(config.pump)] != config.duty:
             connection.target(config.pump, config.duty)
         if found == "off":

@@ -176,21 +176,18 @@ def _text(data: Any, *keys: str) -> str:
     raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected text")
 
 
-def _lengths(data: Any) -> tuple[int, ...]:
-    """Lengths of the three records; the serial agent sends them apart because it cuts the lists."""
-    paths = (("time", "record"), ("OD", "record"), ("ThermometerIR", "record"))
-    lists = [_get(data, *path) for path in paths]
-    if not all(isinstance(x, list) for x in lists):
+def _newest(data: Any) -> tuple[float, ...]:
+    """Last entries of the three records, nan where their lengths differ: the device was just replacing its lists.
+
+    The serial agent sends the lengths apart because it cuts the lists.
+    """
+    lists = {name: _get(data, name, "record") for name in ("time", "OD", "ThermometerIR")}
+    if not all(isinstance(x, list) for x in lists.values()):
         raise ProtocolError("device state: a record is not a list")
     cut = data.get("_records")
-    if isinstance(cut, dict):
-        return tuple(int(_number(cut, path[0])) if math.isfinite(_number(cut, path[0])) else -1 for path in paths)
-    return tuple(len(x) for x in lists)
-
-
-def _last(data: Any, group: str) -> float:
-    values = _get(data, group, "record")
-    return _number({"last": values[-1]}, "last") if values else math.nan
+    lengths = {_number(cut, name) if isinstance(cut, dict) else len(x) for name, x in lists.items()}
+    whole = len(lengths) == 1 and 0 < min(lengths) < math.inf
+    return tuple(_number({"last": x[-1]}, "last") if whole and x else math.nan for x in lists.values())
 
 
 def _terminal(data: Any) -> str:
@@ -223,8 +220,7 @@ def parse_state(body: bytes) -> DeviceState:
     if not isinstance(data, dict):
         raise ProtocolError(f"device state: expected an object, got {body[:60]!r}")
     present = _get(data, "presentDevices")
-    lengths = _lengths(data)
-    whole = len(set(lengths)) == 1 and lengths[0] > 0
+    sample_s, sample_od, sample_temperature = _newest(data)
     cycles = _number(data, "Experiment", "cycles")
     if not (math.isfinite(cycles) and -1 <= cycles < 1e9):
         raise ProtocolError(f"device state: Experiment.cycles = {cycles}, expected a count")
@@ -236,9 +232,9 @@ def parse_state(body: bytes) -> DeviceState:
         running=_flag(data, "Experiment", "ON"),
         cycles=int(cycles),
         start_time=_text(data, "Experiment", "startTime"),
-        sample_s=_last(data, "time") if whole else math.nan,
-        sample_od=_last(data, "OD") if whole else math.nan,
-        sample_temperature=_last(data, "ThermometerIR") if whole else math.nan,
+        sample_s=sample_s,
+        sample_od=sample_od,
+        sample_temperature=sample_temperature,
         measuring=_flag(data, "OD", "Measuring"),
         raw=_number(data, "OD0", "raw"),
         blank=_number(data, "OD0", "target"),
@@ -277,37 +273,29 @@ class Permitted:
 def check_command(path: str, permitted: Permitted) -> None:
     """Check a command before the wire: only these POSTs, only for these reactors, only within these limits.
 
-    Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
-    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow
-    pump (at most 0.95) and supply pumps (0.05); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else
+    A spare pump may run only as the overflow pump, or as a supply pump within the limits of the feed. Everything else
     the device understands wipes, toggles or kills something (docs/device.md, Routes and Client rules).
 
     Raises: DeviceStateError if the command is not one of them.
     """
-    reactors, supply_pumps = permitted.reactors, permitted.supply_pumps
     if permitted.slot_command and path == permitted.slot_command:
         return
-    verb, *args = path.removeprefix("/").split("/")
-    spare = permitted.overflow_pump if permitted.overflow_pump in SPARE else None
-    match verb, args:
-        case "changeDevice", [_]:
+    spare = {pump: _LIMITS[FEED] for pump in permitted.supply_pumps if pump in SPARE}
+    if permitted.overflow_pump in SPARE:
+        spare[permitted.overflow_pump] = (0.0, MAX_OVERFLOW_DUTY)
+    limits, allowed, name = {**_LIMITS, **spare}, False, ""
+    match path.split("/"):
+        case ["", "changeDevice", name] | ["", "MeasureTemp", "IR", name] | ["", "Experiment", "0" | "1", name]:
             allowed = True
-        case "SetOutputTarget", [item, _, value] if item in _LIMITS and re.fullmatch(_NUMBER, value):
-            low, high = _LIMITS[FEED] if item in supply_pumps and item in SPARE else _LIMITS[item]
-            low, high = (0.0, MAX_OVERFLOW_DUTY) if item == spare else (low, high)
+        case ["", "SetOutputTarget", item, name, value] if item in limits and re.fullmatch(_NUMBER, value):
+            low, high = limits[item]
             allowed = low <= float(value) <= high
-        case "SetOutputOn", [item, force, _] if item in _SWITCHES:
-            may_go_on = (*_MAY_GO_ON, spare, *(p for p in supply_pumps if p in SPARE))
-            allowed = force == "0" or (force == "1" and item in may_go_on)
-        case "CalibrateOD", ["OD0", _, raw, "0"] if re.fullmatch(_NUMBER, raw):
+        case ["", "SetOutputOn", item, "0" | "1" as force, name] if item in _SWITCHES:
+            allowed = force == "0" or item in (*_MAY_GO_ON, *spare)
+        case ["", "CalibrateOD", "OD0", name, raw, "0"] if re.fullmatch(_NUMBER, raw):
             allowed = 3000.0 <= float(raw) <= 60000.0
-        case ("MeasureTemp", ["IR", _]) | ("Experiment", ["0" | "1", _]):
-            allowed = True
-        case _:
-            allowed = False
-    position = {"changeDevice": 0, "SetOutputTarget": 1, "SetOutputOn": 2, "CalibrateOD": 1}.get(verb, 1)
-    if not (allowed and path.startswith("/") and args[position] in reactors and args[position] in POSITIONS):
+    if not (allowed and name in permitted.reactors and name in POSITIONS):
         raise DeviceStateError(
             f"refused to send POST {path[:80]}: not among the commands and limits a client may use; "
-            f"reactors of this run: {', '.join(reactors)}"
+            f"reactors of this run: {', '.join(permitted.reactors)}"
         )

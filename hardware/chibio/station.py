@@ -53,7 +53,6 @@ class ChibioStation:
         self._target_c = config.temperature
         self._heat = True
         self._blank = math.nan
-        self._start_time = ""
 
     @property
     def name(self) -> str:
@@ -108,7 +107,6 @@ class ChibioStation:
           waited: an old cycle thread is known to have ended.
         Raises (from its steps): ReactorError.
         """
-        self.busy = True
         try:
             yield from self._let_measure()
             state = self.connection.read()
@@ -131,11 +129,11 @@ class ChibioStation:
             self.doses.escalated = False
             if self.regulation.active:
                 self.regulation.hand_over_again()
-            self._start_time = self._keep_on(self.connection.read()).start_time
+            state = self._keep_on(self.connection.read())
             self.sampling.arrived_s = self.sampling.next_poll = self._clock.now()
             self.book.log(
                 "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
-                start_time=self._start_time,
+                start_time=state.start_time,
             )  # fmt: skip
         finally:
             self.busy = False
@@ -260,7 +258,7 @@ class ChibioStation:
             self.sampling.key, self.sampling.arrived_s, is_new = (state.sample_s, state.cycles), now, False
         age = 0.0 if is_new else now - self.sampling.arrived_s
         fault = diagnose(
-            state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
+            state, self._config, age_s=age, start_time=self._past().start_time, blank=self._blank,
             setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
             ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip

@@ -1,11 +1,10 @@
 """The agenda: tasks at their times, in their order, and an error that costs only its own task."""
 
 import math
-from collections.abc import Iterator
 
 import pytest
 
-from hardware.chibio.agenda import Agenda
+from hardware.chibio.agenda import Agenda, Task
 from hardware.clock import VirtualClock
 
 
@@ -13,7 +12,7 @@ def test_steps_run_when_they_are_due_in_order_and_an_error_removes_one_task_only
     clock = VirtualClock(100.0)
     agenda, tape, closed = Agenda(clock), [], []
 
-    def task(name: str, *pauses: float, fails: bool = False) -> Iterator[float]:
+    def task(name: str, *pauses: float, fails: bool = False) -> Task:
         try:
             for pause in pauses:
                 tape.append((name, clock.now()))
@@ -52,7 +51,7 @@ def test_what_becomes_due_while_steps_run_waits_for_the_next_call() -> None:
     clock = VirtualClock()
     agenda, ran = Agenda(clock), []
 
-    def slow() -> Iterator[float]:
+    def slow() -> Task:
         while True:
             ran.append(clock.now())
             clock.sleep(10.0)
