@@ -5,6 +5,7 @@ import copy
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +36,7 @@ SCHEDULES = [
 ]
 LAWS = {
     "pi": "pi", "pi_tuned": "proportional", "mpc": "midpoint", "inverse": "pi", "dqn": "dqn_preview", "threshold": "pi",
+    "gain_scheduled": "pi",
 }  # fmt: skip
 ANEW = {"_fresh_s"}  # of the interlock: begins anew in a resumed run
 BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them than type and shape
@@ -71,7 +73,9 @@ def unused(kind: str) -> ClosedLoop:
     ratio = registry.build(config, registry.SHARE, policy=preview())
     share = Share(Recall(CompositionEstimator(config.estimator)), ratio, SCHEDULES)
     reactors: Any = SimpleNamespace(names=("M0", "M1"))
-    return ClosedLoop(reactors, law, Interlock(2), SCHEDULES, further=[share])
+    ahead = 20.0 if kind == "pi_tuned" else None  # an estimator beside it
+    schedules = [replace(schedule, announce_min=ahead) for schedule in SCHEDULES]
+    return ClosedLoop(reactors, law, Interlock(2), schedules, further=[share])
 
 
 def written(loop: ClosedLoop) -> dict[str, Any]:
