@@ -17,16 +17,19 @@ from experiments.comparison.trials import Cell, run_trial, windows
 from experiments.control import run
 from experiments.deploy import main
 from experiments.laws import registry
+from experiments.laws.density.baselines import Hold, HoldConfig
 from experiments.laws.density.estimators import WithEstimator
+from experiments.laws.density.inverse import Inverse, InverseConfig
 from experiments.loop.progress import Progress
 from experiments.loop.signals import AIM, Density
 from hardware.emulator.device import plant_preset
+from hardware.safety.interlock import Interlock
 
 STEPS = Scenario((0.5, 0.8, 0.8, 0.3), (37.0, 41.0, 20.0, 30.0), (37.0,) * 4, announce_min=25.0)
 SHORT = Scenario((0.7, 0.4), (50.0, 10.0), (37.0, 30.0), announce_min=9.0)
 
 
-def aim(law: Any, given: Any, steps: list[tuple[float, float, float]], period_min: float) -> list[float]:
+def aim(law: Any, steps: list[tuple[float, float, float]], period_min: float) -> list[float]:
     """What a law is given for setpoint, the next one and the minutes until then, of each reactor."""
     setpoint, following, left = (np.array(column) for column in zip(*steps, strict=True))
     yes, zeros = np.ones(len(steps), dtype=bool), np.zeros(len(steps))
@@ -36,22 +39,11 @@ def aim(law: Any, given: Any, steps: list[tuple[float, float, float]], period_mi
     )  # fmt: skip
     density = Density(law, 1.0, 0.02, period_min)
     density.decide(sample)  # type: ignore[arg-type]
-    assert given.given.tolist() == density.aim.tolist()
+    assert law.given.tolist() == density.aim.tolist()
     return density.aim.tolist()
 
 
 class Law:
-    """Keeps the setpoint that it is given."""
-
-    def reset(self, n: int) -> None:
-        pass
-
-    def act(self, od: Any, setpoint: Any, minute: Any, rows: Any) -> Any:
-        self.given = setpoint
-        return np.zeros(len(od))
-
-
-class Estimating(Law):
     """Full pump takes .14 off ln OD in 2 min; the culture rests at a share of it, .4: mu is .028 1/min."""
 
     def __init__(self, share: float = 0.4) -> None:
@@ -59,29 +51,33 @@ class Estimating(Law):
             full_pump=np.full(3, 0.14), relative=lambda r: (np.zeros(r.size), np.full(r.size, share))
         )
 
-
-@pytest.mark.parametrize("period_min", [2.0, 1.0])
-def test_a_law_without_an_estimate_is_given_one_that_begins_with_the_model(period_min: float) -> None:
-    """Up at 2 % a minute: half of ln(.8/.5) takes 11.75 min. Down at .06 - .02: half of ln(.8/.3), 12.26 min."""
-    model = EnvConfig(mu=0.02, tau=1.0 / 3.0, control_min=period_min)
-    up, down = (0.5 * math.log(0.8 / 0.5) / 0.02, 0.5 * math.log(0.8 / 0.3) / 0.04)
-    for left in np.arange(2.1, 20.0, 0.25):
-        law = Law()
-        beside = WithEstimator(law, model)
-        beside.reset(2)
-        found = aim(beside, law, [(0.5, 0.8, left), (0.8, 0.3, left)], period_min)
-        assert found[0] == (0.8 if left <= up + period_min / 2 else 0.5)
-        assert found[1] == (0.3 if left <= down + period_min / 2 else 0.8)
+    def act(self, od: Any, setpoint: Any, minute: Any, rows: Any) -> Any:
+        self.given = setpoint
+        return np.zeros(len(od))
 
 
-def test_a_law_with_an_estimate_aims_by_it_and_early_where_the_pump_cannot() -> None:
-    """Half of ln(.8/.5) at .028 1/min: 8.39 min; of ln(.8/.3) at .07 - .028: 11.68 min. By the model 7.8 and 16.3."""
-    law = Estimating()
-    assert aim(law, law, [(0.5, 0.8, 9.3), (0.8, 0.3, 12.6), (0.6, 0.6, 1.0)], 2.0) == [0.8, 0.3, 0.6]
-    assert aim(law, law, [(0.5, 0.8, 9.5), (0.8, 0.3, 12.8), (0.6, 0.6, math.inf)], 2.0) == [0.5, 0.8, 0.6]
-    helpless = Estimating(1.0)
+def test_the_lead_is_half_of_the_transition_and_all_that_is_known_where_the_pump_cannot() -> None:
+    """Half of ln(.8/.5) at .028 1/min: 8.39 min; of ln(.8/.3) at .07 - .028: 11.68 min. A period is 2 min."""
+    law = Law()
+    assert aim(law, [(0.5, 0.8, 9.3), (0.8, 0.3, 12.6), (0.6, 0.6, 1.0)], 2.0) == [0.8, 0.3, 0.6]
+    assert aim(law, [(0.5, 0.8, 9.5), (0.8, 0.3, 12.8), (0.6, 0.6, math.inf)], 2.0) == [0.5, 0.8, 0.6]
+    helpless = Law(1.0)
     steps = [(0.8, 0.3, 600.0), (0.5, 0.8, 600.0), (0.8, 0.3, math.inf)]
-    assert aim(helpless, helpless, steps, 2.0) == [0.3, 0.5, 0.8], "full pump holds it at best"
+    assert aim(helpless, steps, 2.0) == [0.3, 0.5, 0.8], "full pump holds it at best"
+
+
+def test_the_estimator_beside_a_law_without_one_believes_what_that_of_a_law_with_one_does() -> None:
+    """Both are told the same readings and doses, which are not what either decided: a pump of 0.7."""
+    model = EnvConfig(mu=0.02, tau=0.4, control_min=2.0)
+    laws = WithEstimator(Hold(HoldConfig(), model), model), Inverse(InverseConfig(), model)
+    for law in laws:
+        law.reset(1)
+        for k in range(40):
+            at = np.array([0.5 + 0.02 * (k % 3)]), np.array([37.0]), np.array([2.0 * k]), np.ones(1, dtype=bool)
+            law.watch(*at)
+            law.act(at[0], np.array([0.5]), at[2], at[3])
+            law.dosed(np.array([0.7 * 20.0 * 0.04]))
+    assert {key: laws[0].explain()[key] for key in laws[1].explain()} == laws[1].explain()
 
 
 def test_a_change_is_known_as_long_ahead_as_the_scenario_says() -> None:
@@ -94,10 +90,7 @@ def test_a_change_is_known_as_long_ahead_as_the_scenario_says() -> None:
             assert left[n] == (ahead[0][0] - minute if known else math.inf)
             assert following[n] == (ahead[0][1] if known else progress.asked(np.full(2, minute))[1][n])
     assert progress.following(np.full(2, np.nan))[1].tolist() == [math.inf] * 2, "in recovery"
-
-
-def test_nobody_knows_ahead_when_a_condition_ends_a_step() -> None:
-    progress = Progress([replace(STEPS, until=("od >= 0.9", None, None, None))])
+    progress = Progress([replace(STEPS, until=("od >= 0.9", None, None, None))])  # nobody knows when it ends
     assert progress.following(np.array([30.0]))[1].tolist() == [math.inf]
     assert progress.following(np.array([60.0]))[1].tolist() == [18.0]
 
@@ -136,7 +129,11 @@ def test_aiming_half_way_costs_less_than_half_of_the_squared_error(kind: str, gr
     assert ise(25.0) < 0.5 * ise(0.0)
 
 
-def test_recording_and_windows_keep_the_setpoint_that_was_asked_for(tmp_path: Path) -> None:
+def test_recording_and_windows_keep_the_setpoint_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged, check = list[float](), Interlock.check
+    monkeypatch.setattr(Interlock, "check", lambda *given: judged.append(float(given[3][0])) or check(*given))
     words = ["plant=nominal", "plant.start_od=0.5", "controller=inverse", "backend.reactors=[M0,M1]"]
     words += ["scenario.setpoints=[0.5,0.7]", "scenario.minutes=[20,9]", "scenario.temperatures=[37,37]"]
     words += ["scenario.announce_min=40", "+each.M1.announce_min=0"]
@@ -149,5 +146,6 @@ def test_recording_and_windows_keep_the_setpoint_that_was_asked_for(tmp_path: Pa
     assert ahead["M1"] == []
     assert {(float(r[AIM]), float(r["setpoint"])) for r in ahead["M0"]} == {(0.7, 0.5)}
     assert [w["setpoint"] for w in summary["windows"]] == [0.5, 0.7] * 2
+    assert judged == [float(row[AIM]) for row in rows["M0"]]
     first = float(ahead["M0"][0]["elapsed_min"])
     assert 0.5 * math.log(1.4) / 0.03 - 1.0 <= 20.0 - first <= 0.5 * math.log(1.4) / 0.03 + 1.0

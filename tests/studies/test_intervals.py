@@ -31,24 +31,6 @@ def test_a_table_for_each_simulator_with_a_row_for_each_kind(tmp_path: Path) -> 
         assert abs(each["median_bias_pct"]["mu"]) < 3 * each["relative_half_width_pct"]["mu"]
 
 
-def none(*kind: object) -> dict[str, object]:
-    """What was asked for, in place of what comes of it."""
-    return {"recordings": kind[3], "refused": kind[3], "wrong_pct": 0.0, "kind": kind}
-
-
-@pytest.mark.parametrize("simulators", [("second",), ("own", "second")])
-def test_long_recordings_are_fewer(
-    simulators: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("tests.studies.intervals.one", none)
-    intervals(IntervalsConfig(7, 3, hours=(6.0, 71.0, 72.0), simulators=simulators, workers=1, seed=4), tmp_path)
-    asked = [each["kind"] for each in json.loads((tmp_path / "summary.json").read_text())["found"]]
-    assert len(asked) == 6 * 3 * 2 * len(simulators)
-    assert {(kind[1], kind[3]) for kind in asked} == {(6.0, 7), (71.0, 7), (72.0, 3)}
-    assert {kind[4] for kind in asked} == {4}
-    assert {path.stem for path in tmp_path.glob("*.md")} == {kind[5] for kind in asked} == set(simulators)
-
-
 def test_a_row_names_mu_before_tau() -> None:
     numbers = {
         "recordings": 8, "refused": 3, "wrong_pct": 12.5, "coverage_pct": {"mu": 80.0, "tau": 100.0},
