@@ -287,9 +287,8 @@ class Doses:
             self._strange_ml[job] += over
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
-            else:
-                who = "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}"
-                self._theirs(job, over, who)
+                continue
+            self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
 
     def _theirs(self, job: str, ml: float, who: str, beside_ml: float = 0.0) -> None:
         self.foreign = f"{job} of {ml:.2f} mL more without our command ({who})"
