@@ -61,9 +61,8 @@ def test_the_lead_is_half_of_the_transition_and_all_that_is_known_where_the_pump
     law = Law()
     assert aim(law, [(0.5, 0.8, 9.3), (0.8, 0.3, 12.6), (0.6, 0.6, 1.0)], 2.0) == [0.8, 0.3, 0.6]
     assert aim(law, [(0.5, 0.8, 9.5), (0.8, 0.3, 12.8), (0.6, 0.6, math.inf)], 2.0) == [0.5, 0.8, 0.6]
-    helpless = Law(1.0)
     steps = [(0.8, 0.3, 600.0), (0.5, 0.8, 600.0), (0.8, 0.3, math.inf)]
-    assert aim(helpless, steps, 2.0) == [0.3, 0.5, 0.8], "full pump holds it at best"
+    assert aim(Law(1.0), steps, 2.0) == [0.3, 0.5, 0.8], "full pump holds it at best"
 
 
 def test_the_estimator_beside_a_law_without_one_believes_what_that_of_a_law_with_one_does() -> None:

@@ -22,6 +22,7 @@ from experiments import deploy
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.figure import figure
 from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate, Requirement, certify, recheck, worst
 from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import attacked
@@ -435,6 +436,12 @@ def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) ->
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert (summary["safe"], summary["passed"]) == (True, True)
     assert [case["case"] for case in summary["cases"]] == ["nominal", "noise", "uncertain", "noise and uncertain"]
+
+
+def test_a_pump_so_weak_that_not_even_the_one_line_law_has_a_band_has_a_figure() -> None:
+    found = proven(replace(laws.law(), actions=0.1 * laws.RATES))
+    assert not found.safe
+    assert figure(found).axes
 
 
 def test_a_policy_that_is_not_safe_ends_the_command_with_one_line_and_its_certificate_says_so(

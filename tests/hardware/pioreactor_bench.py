@@ -166,22 +166,16 @@ class UnitBench:
         return self.go_on(lambda: not self.station.doses.running)
 
     def kill_a_dose(self, monkeypatch: pytest.MonkeyPatch, at_its_end: bool = False) -> None:
-        """The next dose of media is killed as the vial is told that its pump goes on, or before it is told off.
-
-        A short run that proves the pump off may still come before that dose: it is no dose, and is left alone.
-        """
+        """Kill the next dose (no short run) as the vial is told that its pump goes on, or before it is told off."""
         vial, begun = self.rig.vials.vials[UNIT], list[int]()
         drive = vial.drive
-
-        def a_dose(pid: int) -> bool:
-            return b"--ml" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
 
         def kills(pin: int, duty: float, pid: int, now: float) -> None:
             ends = at_its_end and begun == [pid] and duty == 0.0
             if not ends:
                 drive(pin, duty, pid, now)
-            # from here on the chip is told; the unit and its broker are not yet
-            begins = pin == 13 and duty > 0.0 and not begun and a_dose(pid)
+            dose = b"--ml" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            begins = dose and pin == 13 and duty > 0.0 and not begun  # the chip was told; the unit and its broker not
             begun.extend([pid] * begins)
             if ends or (begins and not at_its_end):
                 os.kill(pid, signal.SIGKILL)
