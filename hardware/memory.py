@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from types import NoneType
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Remembers", "Words", "restore", "restore_rows", "row", "rows", "save", "words"]
+__all__ = ["Remembers", "restore", "restore_rows", "row", "rows", "save"]
 
 KINDS: dict[str, tuple[set[type], str]] = {
     "b": ({bool}, "true or false"),
@@ -34,41 +34,24 @@ class Remembers(Protocol):
         """The keys of its state."""
 
 
-class Words(NamedTuple):
-    """How a refusal is worded: of a state without keys, of a wrong value, another shape, another number of reactors."""
-
-    whole: str
-    wrong: str
-    shape: str
-    reactors: str
-
-
-def words(path: str) -> Words:
-    """Build the refusals of a state stored under `path`."""
-    shape = f"{path}.{{key}} has shape {{found}}, this run needs {{shape}}"
-    return Words(
-        f"{path}: {{value}}, expected keys and values", f"{path}.{{key}}: {{value}}, expected {{what}}", shape, shape
-    )
-
-
 def save(owner: Remembers) -> dict[str, Any]:
     """Everything that `owner` remembers, as plain numbers and lists; None stands for what is not finite."""
     return {key: _plain(getattr(owner, _name(owner, key))) for key in owner.remembers}
 
 
-def restore(owner: Remembers, state: Any, said: Words) -> None:
-    """Continue as saved; `owner` has not been used yet. Raises: ValueError naming what is missing or does not fit."""
+def restore(owner: Remembers, state: Any, path: str) -> None:
+    """Continue as saved under `path`; `owner` has not been used yet. Raises: ValueError naming what does not fit."""
     if not isinstance(state, Mapping):
-        raise ValueError(said.whole.format(value=str(state)[:40]))
+        raise ValueError(f"{path}: {str(state)[:40]}, expected keys and values")
     for key in owner.remembers:
         name = _name(owner, key)
         now, value = getattr(owner, name), state.get(key, "missing")
         if isinstance(now, Remembers):
-            restore(now, value if isinstance(value, Mapping) else {}, said)
+            restore(now, value if isinstance(value, Mapping) else {}, f"{path}.{key}")
         elif isinstance(now, list):
-            _restore_streams(now, key, value, said)
+            _restore_streams(now, f"{path}.{key}", value)
         else:
-            new = _fitted(np.asarray(now), key, value, said)
+            new = _fitted(np.asarray(now), f"{path}.{key}", value)
             setattr(owner, name, new if isinstance(now, np.ndarray) else new.item())
     _resume(owner)
 
@@ -88,13 +71,11 @@ def restore_rows(owner: Remembers, state: Any, path: str) -> None:
     n = _reactors(owner)
     if n and not (isinstance(state, list) and len(state) == n):
         raise ValueError(f"{path}: {str(state)[:40]}, expected one entry for each of {n} reactors")
-    wrong = f"{path}: {{key}} {{value}}, expected {{what}}"
-    shape = f"{path}: {{key}} {{value}} has shape {{found}}, this run needs {{shape}}"
     for i in range(n):
         mine = state[i] if isinstance(state[i], Mapping) else {}
         for key in owner.remembers:
             values = getattr(owner, _name(owner, key))
-            new = _fitted(_unpadded(values[i]), key, mine.get(key, "missing"), Words("", wrong, shape, shape))
+            new = _fitted(_unpadded(values[i]), f"{path}.{key}", mine.get(key, "missing"))
             values[(i, slice(new.size)) if new.ndim else i] = new
     _resume(owner)
 
@@ -125,13 +106,8 @@ def _plain(value: Any) -> Any:
     return [rng.bit_generator.state for rng in value] if isinstance(value, list) else value
 
 
-def _fitted(now: NDArray[Any], key: str, value: Any, said: Words) -> NDArray[Any]:
+def _fitted(now: NDArray[Any], key: str, value: Any) -> NDArray[Any]:
     """Convert a saved value to an array like `now`. Raises: ValueError."""
-
-    def refused(form: str, what: str = "", found: tuple[int, ...] = ()) -> ValueError:
-        text = {"key": key, "value": str(value)[:40], "what": what, "found": found, "shape": now.shape}
-        return ValueError(form.format(**text, k=found[0] if found else 0, n=now.shape[0] if now.ndim else 1))
-
     types, what = KINDS[now.dtype.kind]
     try:
         given = np.array(value, dtype=object)
@@ -139,20 +115,19 @@ def _fitted(now: NDArray[Any], key: str, value: Any, said: Words) -> NDArray[Any
     except (TypeError, ValueError, OverflowError):
         new = None
     if new is None:
-        raise refused(said.wrong, what)
+        raise ValueError(f"{key}: {str(value)[:40]}, expected {what}")
     if new.shape != now.shape:
-        other = new.ndim and now.ndim and len(new) != len(now)
-        raise refused(said.reactors if other else said.shape, what, new.shape)
+        raise ValueError(f"{key} has shape {new.shape}, this run needs {now.shape}: was it of as many reactors?")
     if np.isinf(new).any() or np.isfinite(now[np.isnan(new)]).any():  # nan would pass every limit
-        raise refused(said.wrong, f"finite {what}")
+        raise ValueError(f"{key}: {str(value)[:40]}, expected finite {what}")
     return np.where(np.isnan(new), now, new)
 
 
-def _restore_streams(streams: list[np.random.Generator], key: str, state: Any, said: Words) -> None:
+def _restore_streams(streams: list[np.random.Generator], key: str, state: Any) -> None:
     if not (isinstance(state, list) and len(state) == len(streams)):
-        raise ValueError(said.wrong.format(key=key, value=str(state)[:40], what=f"{len(streams)} random streams"))
+        raise ValueError(f"{key}: {str(state)[:40]}, expected {len(streams)} random streams")
     for rng, stored in zip(streams, state, strict=True):
         with suppress(TypeError, ValueError, KeyError, OverflowError):
             rng.bit_generator.state = stored
         if rng.bit_generator.state != stored:
-            raise ValueError(said.wrong.format(key=key, value=str(stored)[:40], what="the state of a random stream"))
+            raise ValueError(f"{key}: {str(stored)[:40]}, expected the state of a random stream")

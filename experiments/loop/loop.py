@@ -26,9 +26,7 @@ from hardware.safety.interlock import Interlock, Ruling
 
 __all__ = ["ClosedLoop", "Step"]
 
-WRONG = "{key}: {value}, expected a list of {what}"
 OURS = (THERMOSTAT, *SPARE.values())  # the others reach the reactors by their names
-OWN = memory.Words("{value}, expected keys and values", WRONG, WRONG, "{key} is for {k} reactors, this run has {n}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -304,13 +302,13 @@ class ClosedLoop:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
-        memory.restore(self, state, OWN)
+        memory.restore(self, state, "loop")
         for key, part in self._rows.items():
             memory.restore_rows(part, state.get(key, "missing"), key)
         self.interlock.restore(state.get("interlock", "missing"))
         for signal in self.signals:
             if signal.memory is not None:
-                memory.restore(signal.memory, state.get(signal.name, "missing"), memory.words(signal.name))
+                memory.restore(signal.memory, state.get(signal.name, "missing"), signal.name)
 
     @property
     def _rows(self) -> dict[str, Remembers]:

@@ -46,39 +46,16 @@ GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the 
 lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
 differ for an instant while the device appends; "Terminal.text" is cut to its newest 80 characters. RAW gives it whole.
 
-One client in charge
---------------------
-A client is named by the line it comes on and its session. The first whose valid request arrives is in charge until its
-BYE, or until the dead-man switch has made its first pass after its silence. Meanwhile every request of another one is
-refused in one line (status 21, over HTTP 409) and is no heartbeat: a second client on the serial line, a second one
-over HTTP, or one on each. A client that was killed and starts again under the same session goes on at once.
+Dead man, one client, HTTP
+--------------------------
+What the switch does, who is in charge and what is refused: docs/board_agent.md. A client is named by the line it comes
+on and its session, so one that was killed and starts again under the same session goes on at once.
 
-Dead man
---------
-Every valid request of the client in charge is a heartbeat. After `--deadman` seconds without one, Pump1 to Pump4 of
-every present reactor are switched off, read back, and the pass is repeated until it is verified or a heartbeat comes. A
-reactor whose on-board regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. Because the
-device answers 204 even if its bus is dead, each pass ends with MeasureTemp/IR: if the bus hangs, that request makes the
-server restart itself with everything off (docs/device.md, Failures), otherwise it does nothing. It is armed from the
-start on; BYE disarms it (a client that has left everything in order) until the next request that is not BYE. On SIGTERM
-a live session's pumps are switched off before the agent ends.
-
-Beside an HTTP link
--------------------
-`--http ADDRESS:PORT` listens there and carries the requests of a client that knows the token to the device, so a client
-that uses this address instead of the device's has the same switch. A request needs, in this order:
-
-    Host             this address, localhost (an ssh tunnel), or a name given with --host: a web page that has had its
-                     own name resolved to this address is refused (403)
-    no Origin        browsers send one with every POST of a page; the agent serves no page (403)
-    Authorization    Bearer TOKEN, what stands in --token-file; without the file the agent does not listen (401)
-    X-Session        0 to 65535, names the client; 0 if it is left out
-
-No route of the device takes a body, so a POST says Content-Length: 0, once (else 411, 413 or 400). A head is at most
-8192 bytes and must be there within 5 s, and of 33 connections that have not shown the token the oldest is ended. The
-agent's own routes: GET /_agent/status (the JSON of HELLO; no heartbeat, from any session), POST /_agent/heartbeat (204)
-for a client that talks to the device directly, and POST /_agent/bye (204). 502 means that the device refused the
-connection, 504 that no usable answer came. A refusal is one line of text; it was not carried out and is no heartbeat.
+`--http ADDRESS:PORT` carries HTTP requests to the device. A request needs a Host that is this board, no Origin,
+Authorization: Bearer TOKEN (--token-file), and may name its session, X-Session: 0 to 65535. No route of the device
+takes a body, so a POST says Content-Length: 0. The agent's own routes: GET /_agent/status (the JSON of HELLO; no
+heartbeat, from any session), POST /_agent/heartbeat (204) for a client that talks to the device directly, and POST
+/_agent/bye (204). 502: the device refused the connection; 504: no usable answer came.
 """
 
 from __future__ import annotations
@@ -191,12 +168,16 @@ def reduce_sysdata(body: bytes) -> bytes:
 # -- the device ----------------------------------------------------------------------------------------------------
 
 
-class Unanswered(Exception):
-    """The device gave no answer; `status` says how far the request got."""
+class Failure(Exception):
+    """A request that failed: a status and one line of text."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
         self.status = status
+
+
+class Unanswered(Failure):
+    """The device gave no answer; `status` says how far the request got."""
 
 
 def hang_up(line: socket.socket) -> None:
@@ -511,12 +492,8 @@ class SerialPort:
 # -- HTTP ----------------------------------------------------------------------------------------------------------
 
 
-class Refusal(Exception):
+class Refusal(Failure):
     """A request that is not carried out; `status` is that of HTTP, the message one line for the client."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 REASONS = {

@@ -32,13 +32,11 @@ def save_calibration(folder: Path, reactor: str, part: str, values: Mapping[str,
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
     try:
-        content = yaml.safe_load(read_text(path))
+        content = yaml.safe_load(read_text(path)) if path.is_file() else None
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise UnfitError(f"calibration {path}: not readable ({str(error).splitlines()[0]}); measure again") from None
-    if content is None:  # an empty file
+    if content is None:  # no file, or an empty one
         return {}
     if not isinstance(content, dict):
         raise UnfitError(f"calibration {path}: no keys and values; measure again")
@@ -59,6 +57,6 @@ def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCali
             if not math.isnan(counts) and not 3000.0 <= counts <= 60000.0:
                 raise ValueError(f"blank = {counts}: allowed 3000 to 60000 counts")
         except (TypeError, ValueError) as error:
-            raise UnfitError(f"calibration of {name} in {folder}: {error}") from None
+            raise UnfitError(f"calibration of {name} in {folder}: {error}; measure it again") from None
         calibrations.append(ReactorCalibration(pumps[0], pumps[1], counts))
     return calibrations

@@ -3,12 +3,21 @@
 import math
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.onboard_regulation import describe, regulates
 from hardware.chibio.protocol import DeviceState
 from hardware.errors import DeviceStateError, IdentityError, ReactorError
 from hardware.reactor import Fault
 
-__all__ = ["diagnose", "fault_of"]
+__all__ = ["describe", "diagnose", "fault_of", "regulates"]
+
+
+def regulates(state: DeviceState, setpoint: float) -> bool:
+    """Whether the device regulates at `setpoint`; False for nan."""
+    return state.regulating and abs(state.regulation_target - setpoint) <= 1e-5
+
+
+def describe(state: DeviceState) -> str:
+    """Describe what the on-board regulation does."""
+    return f"on-board OD regulation is {'on' if state.regulating else 'off'}, target {state.regulation_target:g}"
 
 
 def diagnose(

@@ -73,7 +73,6 @@ class DoseSequence:
         self.escalated = False
         self.extra: list[Given] = []
         self.acted: tuple[float, int] | None = None
-        self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
         self._given_up: dict[str, float] = {}  # pumps whose command brought no answer and may yet be carried out, since
         self.stray_s = -math.inf
@@ -87,23 +86,19 @@ class DoseSequence:
         """Continue as an earlier life of the run left it; its pumps are to be verified off next."""
         history = self._past()
         self._quiet_s = history.seen_s
-        self.acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
+        self.acted = history.sample
         if history.open:
             self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open by an earlier life of the program")
 
     @property
     def carry_ml(self) -> float:
         """Asked for and put off to the next dose, because it is less than the pump can deliver, mL."""
-        return self._carry_ml
+        return self._past().carry_ml
 
     @property
     def unsettled(self) -> bool:
         """Whether a dose is past its end and what it gave is not known yet: a sample waits for that a little."""
         return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
-
-    def _may_be_late(self, pump: str) -> bool:
-        """Whether a command to this pump was given up and may still be carried out."""
-        return self._book.elapsed() < self._given_up.get(pump, -math.inf) + LATE_S
 
     def begin(
         self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
@@ -125,9 +120,6 @@ class DoseSequence:
             self._book.tell(f"no dose: {reason}")
             return DosePlan()
         self.acted = sample
-        if pump == FEED:
-            self._carry_ml = plan.carry_ml
-        self._doses += plan.feed_duty > 0.0
         if plan.carry_ml > 0.0 and rate > 0.0 and pump == FEED:
             self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
         if plan.shortfall_ml > 0.0:
@@ -138,11 +130,11 @@ class DoseSequence:
     def _plan(self, rate: float, pump: str) -> DosePlan:
         """Plan the dose by a pump; every pump but the feed has its declared flow and starts without a carry."""
         if pump == FEED:
-            return plan_dose(rate, self._carry_ml, self._doses, self._calibration, self._config.dosing)
+            return plan_dose(rate, self.carry_ml, self._past().doses, self._calibration, self._config.dosing)
         if pump not in self._config.supply.pumps:
             return DosePlan(pump=pump)
         own = replace(self._calibration, feed=self._calibrated(pump))
-        return replace(plan_dose(rate, 0.0, self._doses, own, self._config.dosing), pump=pump)
+        return replace(plan_dose(rate, 0.0, self._past().doses, own, self._config.dosing), pump=pump)
 
     def _calibrated(self, pump: str) -> PumpCalibration:
         """Flow of the pump that feeds."""
@@ -165,10 +157,12 @@ class DoseSequence:
 
     def _intend(self, plan: DosePlan, rate: float) -> None:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
+        doses = self._past().doses + (plan.feed_duty > 0.0)
         self._book.write(
             "intent",
             sample=self.acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
-            waste_ml=plan.waste_ml, carry_ml=self._carry_ml, doses=self._doses, on_s=self._book.elapsed(),
+            waste_ml=plan.waste_ml, carry_ml=plan.carry_ml if plan.pump == FEED else self.carry_ml, doses=doses,
+            on_s=self._book.elapsed(),
             **({} if plan.pump == FEED else {"feed_pump": plan.pump}),
         )  # fmt: skip
 
@@ -350,7 +344,8 @@ class DoseSequence:
         self._book.log("dose_end", **ending.row())
         booked_ml = known.feed_ml if known.fed else 0.0
         self.extra += ending.beyond(booked_ml)
-        if known.fed and self._may_be_late(known.feed_pump) and not note:
+        may_be_late = self._book.elapsed() < self._given_up.get(known.feed_pump, -math.inf) + LATE_S
+        if known.fed and may_be_late and not note:
             twice = f"{ending.feed_ml:.2f} to {2.0 * ending.feed_ml:.2f} mL, booked as the former"
             self._book.tell(f"a dose gave {twice}: a feed command that was given up may have been heard in it")
         if known.fed and math.isnan(known.feed_on[1]):

@@ -1,15 +1,13 @@
 """Volume to pump time: the one place where mL become a duty (docs/device.md, Pumps and Waste)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conf.schema import check, require, setting
+from conf.schema import build, check, require, setting
 from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
 from hardware.stations import Plan
 
@@ -35,29 +33,18 @@ MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 class PumpCalibration:
     """Volume of one dose: v = flow_ml_s * (63 s * duty + bias_s), with a relative spread from dose to dose.
 
-    flow_ml_s: flow at full power, mL/s.
-    bias_s: the motor runs this much longer than asked (positive), or delivers nothing for that long (negative), s.
-    spread: standard deviation of a single dose relative to its volume.
-    min_on_s: shortest on-time that delivers dependably, s.
-    date, device_id: when and on which unit it was weighed; "" for nominal values.
+    bias_s: negative where the motor delivers nothing for that long. Raises: ValueError naming key, value and range.
     """
 
-    flow_ml_s: float = 1.0
-    bias_s: float = 0.0
-    spread: float = 0.1
-    min_on_s: float = 0.3
-    date: str = ""
-    device_id: str = ""
+    flow_ml_s: float = setting(1.0, "flow at full power", "mL/s", within=(0.05, 5.0))
+    bias_s: float = setting(0.0, "the motor runs so much longer than asked", "s", within=(-1.0, 1.0))
+    spread: float = setting(0.1, "sd of a single dose relative to its volume", within=(0.0, 1.0))
+    min_on_s: float = setting(0.3, "shortest on-time that delivers dependably", "s", within=(0.0, 2.0))
+    date: str = setting("", "when it was weighed; '': never, nominal values")
+    device_id: str = setting("", "on which unit it was weighed")
 
     def __post_init__(self) -> None:
-        ranges = {"flow_ml_s": (0.05, 5.0), "bias_s": (-1.0, 1.0), "spread": (0.0, 1.0), "min_on_s": (0.0, 2.0)}
-        for key, (low, high) in ranges.items():
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise ValueError(
-                    f"pump calibration {key} = {value}: allowed {low} to {high}; weigh the doses again "
-                    "(python -m experiments.calibrate_pump)"
-                )
+        check(self, "pump calibration")
 
     def on_time(self, volume_ml: float) -> float:
         """Seconds to ask for so that `volume_ml` flows; not below 0."""
@@ -73,17 +60,11 @@ class PumpCalibration:
         return self.volume(self.min_on_s)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> PumpCalibration:
-        """Invert `asdict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
-
-        A file may hold more than this, for instance the weighings it rests on.
-        """
-        known = {f.name for f in fields(cls)}
-        try:
-            numbers = {k: float(v) for k, v in values.items() if k in known - {"date", "device_id"}}
-            return cls(**numbers, date=str(values.get("date", "")), device_id=str(values.get("device_id", "")))
-        except TypeError as error:
-            raise ValueError(f"pump calibration: {error}; weigh the doses again") from error
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Invert `asdict`; further keys, as of the weighings, are ignored. Raises: ValueError naming key and range."""
+        known = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        texts = {key: str(known[key]) for key in ("date", "device_id") if key in known}  # YAML makes a date of a date
+        return build(cls(), known | texts, "pump calibration")
 
 
 @dataclass(frozen=True)
@@ -248,25 +229,19 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
     if not (np.all(np.isfinite(t + n + y)) and np.all(t > 0.0) and np.all(n >= 1) and np.all(y >= 0.0)):
         raise ValueError("pump calibration: on-times must be > 0 s, doses >= 1, grams >= 0, all finite")
     if np.ptp(t) < 0.2:
-        raise ValueError(
-            f"pump calibration: on-times {t.min():.2f} to {t.max():.2f} s: allowed a range of 0.2 s or more"
-        )
+        raise ValueError(f"pump calibration: on-times {t.min():.2f} to {t.max():.2f} s: allowed a range of 0.2 s")
     dose = y / n
-    mean_t, mean_y = np.average(t, weights=n), np.average(dose, weights=n)
-    sxx = np.sum(n * (t - mean_t) ** 2)
-    flow = float(np.sum(n * (t - mean_t) * (dose - mean_y)) / sxx)
-    if flow <= 0.0:
-        raise ValueError(
-            f"pump calibration: fitted flow {flow:.3f} mL/s: longer doses weighed less; repeat the weighing"
-        )
-    bias = float(mean_y / flow - mean_t)
+    (flow, at_0), covariance = np.polyfit(t, dose, 1, w=np.sqrt(n), cov="unscaled")
+    if flow <= 1e-9:
+        raise ValueError(f"pump calibration: fitted flow {flow:.3f} mL/s: longer doses weighed less; weigh again")
+    bias = float(at_0 / flow)
     residual = dose - flow * (t + bias)
     freedom = t.size - 2
     sigma = math.sqrt(float(np.sum(n * residual**2)) / freedom) if freedom > 0 else math.nan  # mL, of one dose
-    flow_se = sigma / math.sqrt(float(sxx))
-    bias_se = sigma / flow * math.sqrt(1.0 / float(np.sum(n)) + (mean_t + bias) ** 2 / float(sxx))
+    slopes = np.array([-bias, 1.0]) / flow  # of the bias, by flow and dose at 0 s
+    flow_se, bias_se = sigma * math.sqrt(covariance[0, 0]), sigma * math.sqrt(slopes @ covariance @ slopes)
     spread = min(sigma / float(np.mean(dose)), 1.0) if math.isfinite(sigma) else 0.1
     useful = t[dose >= 0.7 * flow * np.maximum(t + bias, 1e-9)]
     min_on = float(np.clip(useful.min() if useful.size else t.max(), 0.3, 2.0))
-    calibration = PumpCalibration(flow, bias, spread, min_on, date, device_id)
+    calibration = PumpCalibration(float(flow), bias, spread, min_on, date, device_id)
     return PumpFit(calibration, flow_se, bias_se)

@@ -7,7 +7,7 @@ read first, toggled only if it has to be, and read back. It costs about a second
 import math
 from dataclasses import dataclass
 
-from conf.schema import check, setting
+from conf.schema import check, require, setting
 from hardware.chibio.connection import Connection
 from hardware.chibio.protocol import BANDS, LEDS, SLOTS, DeviceState, Slot
 from hardware.logbook import Logbook
@@ -35,8 +35,7 @@ class FluorescenceSlotConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend.fluorescence")
-        if self.band == self.base_band:
-            raise ValueError(f"backend.fluorescence.band = {self.band}: allowed another than base_band")
+        require(self.band != self.base_band, "backend.fluorescence.band", self.band, "another than base_band")
 
     @property
     def command(self) -> str:
@@ -100,10 +99,7 @@ class Fluorescence:
         return state, self._config.wrong(state)
 
     def reading(self, state: DeviceState) -> float:
-        """Return counts of the band in the newest sample, base times emission; nan where there are none.
-
-        Args: state: that brought the sample.
-        """
+        """Return the counts of the band in the sample that `state` brought; nan where there are none."""
         slot, old = self._config.own(state), state.cycles == self._switched_in
         if old or slot is None or not self._config.measure or self._config.wrong(state):
             return math.nan

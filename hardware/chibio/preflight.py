@@ -35,9 +35,7 @@ def preflight(
 ) -> list[Check]:
     """Disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors, pump calibration.
 
-    Args:
-      transport, clock, config, calibrations, bench: as for `ChiBioReactors`.
-      folder: where the run will write; its disk is checked.
+    Args: as for `ChiBioReactors`; folder: where the run will write, its disk is checked.
     Raises: nothing about the device; a check that cannot be made has failed.
     """
     checks = [_disk(folder)] if folder is not None else []

@@ -50,14 +50,12 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         bench: Bench | None = None,
     ) -> None:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
-        if len(calibrations) != len(config.reactors):
-            raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
         super().__init__(clock, config.stale_s, log)
         self.config, self._bench = config, bench or Bench()
         self._link = SharedLink(transport, clock)
         self._past = dict.fromkeys(config.reactors, ReactorHistory())
         self._agenda = Agenda(clock)
-        self.stations = tuple(map(self._station, config.reactors, calibrations))
+        self.stations = tuple(self._station(*one) for one in zip(config.reactors, calibrations, strict=True))
 
     def _station(self, name: str, calibration: ReactorCalibration) -> ChibioStation:
         connection = Connection(name, self.config.permitted, self._link, self._clock, self.note_down)
@@ -137,12 +135,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         self._clock.sleep(max(min(longest_s, self._agenda.next_due() - self._clock.now()), 0.01))
 
     def stop(self) -> None:
-        """All pumps of all reactors off, overflow pumps too, verified; tried for `stop_s`, then escalated. Idempotent.
-
-        Experiments go on (stirred, heated, measured). A reactor handed over to the on-board regulation is left to it,
-        with its overflow pump.
-        Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
-        """
+        """As `Stations.stop`, overflow pumps too; tried for `stop_s`, then escalated. A dead-man switch rests then."""
         super().stop()
         self._link.disarm()
 

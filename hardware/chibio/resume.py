@@ -59,9 +59,8 @@ class ReactorHistory(History):
         if kind == "intent":
             feed_s, waste_s = (PERIOD_S * float(row[f"{part}_duty"]) for part in ("feed", "waste"))
             return replace(
-                known, experiment=known.start_time, feed_pump=feeds_by(row), feed_on=NEVER,
-                waste_on=NEVER, feed_off=NEVER, waste_off=NEVER, feed_s=feed_s, waste_s=waste_s, feed_tried=math.nan,
-                waste_tried=math.nan, feed_anew=NEVER, waste_anew=NEVER,
+                known, experiment=known.start_time, feed_pump=feeds_by(row), feed_s=feed_s, waste_s=waste_s,
+                feed_tried=math.nan, waste_tried=math.nan, **dict.fromkeys(SPANS, NEVER),  # type: ignore[arg-type]
             )  # fmt: skip
         if kind == "command" and known.open:
             return known._switched(

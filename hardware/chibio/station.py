@@ -8,11 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 from hardware.chibio.agenda import Task
-from hardware.chibio.diagnosis import diagnose, fault_of
+from hardware.chibio.diagnosis import describe, diagnose, fault_of, regulates
 from hardware.chibio.dose_sequence import Context, DoseSequence
 from hardware.chibio.dosing import DosePlan
 from hardware.chibio.fluorescence import Fluorescence
-from hardware.chibio.onboard_regulation import OnboardRegulation, regulates
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, PUMPS, DeviceState
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
@@ -32,25 +31,25 @@ AGAIN_S = 60.0  # from a restart that failed to the next one
 class ChibioStation:
     """One reactor under control.
 
-    Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy, while the reactor is being
-      started or recovered; restored, whether it goes on from what an earlier life left.
+    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; regulated_od, OD at which it was handed over to
+      the on-board regulation, nan while this program controls; busy, while the reactor is being started or recovered;
+      restored, whether it goes on from what an earlier life left.
     """
 
     def __init__(self, context: Context) -> None:
         self.connection, self.book = connection, book = context.connection, context.book
         self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
-        self._volume_ml = context.volume_ml
-        self._past, self._clock, config = context.past, connection.clock, context.config
-        self.sampling = Sampling(config, self._clock)
+        self._volume_ml, self._past, self._clock = context.volume_ml, context.past, connection.clock
+        self.sampling = Sampling(self._config, self._clock)
         self.doses = DoseSequence(context)
-        self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
-        self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
-        self.fluorescence = Fluorescence(connection, config.fluorescence, book)
+        self.regulated_od = math.nan
+        self.overflow_pump = OverflowPump(connection, self._config.overflow_pump, book)
+        self.fluorescence = Fluorescence(connection, self._config.fluorescence, book)
         self.busy = self.restored = False
         self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
         self._spoilt = False  # it was told that the device holds something that is no number
         self._ended = ""  # why this program ended the experiment, "" once it runs again
-        self._target_c = config.temperature
+        self._target_c = self._config.temperature
         self._heat = True
         self._blank = math.nan
 
@@ -74,7 +73,7 @@ class ChibioStation:
     @property
     def handed_over(self) -> bool:
         """Whether the on-board regulation has it."""
-        return self.regulation.active
+        return math.isfinite(self.regulated_od)
 
     # ------------------------------------------------------------------------------------------- start and recovery
 
@@ -90,11 +89,11 @@ class ChibioStation:
             self._target_c = history.temperature
         state = self.connection.read()
         self._blank = next((b for b in (history.blank, self._calibration.blank) if math.isfinite(b)), state.blank)
-        self.overflow_pump.was_on, self.regulation.setpoint = history.overflow_pump_on, history.handed_over
+        self.overflow_pump.was_on, self.regulated_od = history.overflow_pump_on, history.handed_over
         self.doses.restore()
-        if not regulates(state, self.regulation.setpoint):
+        if not regulates(state, self.regulated_od):
             if state.regulating:
-                self.regulation.switch_off()
+                self._take_control()
             self.doses.settle(tries=3)
             if on := self._config.overflow_pump.others_on(state):
                 self.book.tell(f"pumps were found on and switched off: {on}")
@@ -103,9 +102,7 @@ class ChibioStation:
     def bring_up(self, waited: bool = False) -> Task:
         """Task: an experiment that runs with the right blank and targets; a running one is adopted, not restarted.
 
-        Args:
-          waited: an old cycle thread is known to have ended.
-        Raises (from its steps): ReactorError.
+        Args: waited: an old cycle thread is known to have ended. Raises (from its steps): ReactorError.
         """
         try:
             yield from self._let_measure()
@@ -127,8 +124,8 @@ class ChibioStation:
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
             self.doses.escalated = False
-            if self.regulation.active:
-                self.regulation.hand_over_again()
+            if self.handed_over:
+                self._hand_over_again()
             state = self._keep_on(self.connection.read())
             self.sampling.arrived_s = self.sampling.next_poll = self._clock.now()
             self.book.log(
@@ -156,9 +153,9 @@ class ChibioStation:
         The device's flag says it only while an experiment runs: one that is stopped or dies in a measurement leaves it
         for good, until the next start (docs/device.md, Cycle).
         """
-        since = self.connection.clock.now()
+        since = self._clock.now()
         while (state := self.connection.read()).running and state.measuring:
-            if self.connection.clock.now() - since > MEASURING_S:
+            if self._clock.now() - since > MEASURING_S:
                 return
             yield 2.0
 
@@ -168,8 +165,8 @@ class ChibioStation:
         if state.pumping_modes:
             modes = ", ".join(state.pumping_modes)
             raise DeviceStateError(f"{self.name}: {modes} is on; switch it off in the device's web page")
-        if state.regulating and not self.regulation.active:
-            self.regulation.switch_off()
+        if state.regulating and not self.handed_over:
+            self._take_control()
         if not abs(state.blank - self._blank) <= 0.5:  # also nan
             connection.set_blank(self._blank)
         for item, value, wanted in (
@@ -251,7 +248,7 @@ class ChibioStation:
     def _judge(self, state: DeviceState) -> bool:
         """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
-        self.doses.watch(state, ours=not self.regulation.active)
+        self.doses.watch(state, ours=not self.handed_over)
         self._unspoil(state)
         is_new = self.sampling.look(state, now)
         if is_new and now < self.doses.stray_s + FIRST_SAMPLE_S:  # measured before or after that, nobody knows
@@ -259,7 +256,7 @@ class ChibioStation:
         age = 0.0 if is_new else now - self.sampling.arrived_s
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._past().start_time, blank=self._blank,
-            setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
+            setpoint=self.regulated_od, dosing=self.doses.running, stuck=self.doses.stuck,
             ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip
         self.book.report(fault)
@@ -343,7 +340,7 @@ class ChibioStation:
         Args: rate: mL/s. number: of the pump that feeds.
         """
         refusal, pump = "", f"Pump{number}"
-        if self.regulation.active:
+        if self.handed_over:
             refusal = "handed over to the on-board regulation"
         elif self.busy or self.book.fault is not None:
             refusal = str(self.book.fault or "being started")
@@ -358,12 +355,43 @@ class ChibioStation:
 
     def give_up(self) -> None:
         """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""
-        self.regulation.take_back()
+        if self.handed_over:
+            self.connection.switch("OD", False)
+            self.book.log("regulate", setpoint=None)
+            self.regulated_od = math.nan
+            self.book.tell("on-board regulation switched off: the reactor is given up")
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError."""
-        self.regulation.hand_over(setpoint)
+        """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError.
+
+        Written down before it is done: a run that is killed in between hands over when it is resumed.
+        """
+        connection = self.connection
+        connection.pumps_off(pumps=self._config.overflow_pump.others)
+        self.book.log("regulate", setpoint=setpoint)
+        connection.target("OD", setpoint)
+        connection.switch("OD", True)
+        state = connection.read()
+        if not regulates(state, setpoint):
+            raise DeviceStateError(f"{self.name}: {describe(state)} after it was switched on at {setpoint:g}")
+        self.regulated_od = setpoint
+
+    def _hand_over_again(self) -> None:
+        """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
+        state, what = self.connection.read(), "left to it"
+        if not regulates(state, self.regulated_od):
+            self.regulate(self.regulated_od)
+            what = f"handed over again, because its {describe(state)}"
+        self.book.tell(
+            f"handed over to the on-board regulation at OD {self.regulated_od:g} earlier in this run: {what}"
+        )
+
+    def _take_control(self) -> None:
+        """Switch the on-board regulation off, which was found on. Raises: ReactorError."""
+        self.connection.switch("OD", False)
+        if not self.handed_over:
+            self.book.tell("the on-board OD regulation was found on and switched off: this run controls")
 
     def set_temperature(self, target_c: float) -> None:
         """Thermostat target, degC; nan leaves it. A failure becomes a note, and the next call tries again."""

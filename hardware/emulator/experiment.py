@@ -59,11 +59,6 @@ class Experiment:
         yield from self._outputs.everything_off()
         self._position.terminal("Experiment Stopped")
 
-    def _cut_short(self) -> Steps:
-        """End a cycle that was stopped before its record: it does not count."""
-        self._position.data["Experiment"]["cycles"] -= 1
-        yield from self._finish()
-
     def _cycle(self) -> Steps:
         """`runExperiment`: one cycle of about 60 s (docs/device.md, Cycle)."""
         data, experiment, computer = self._position.data, self._position.data["Experiment"], self._position.computer
@@ -76,12 +71,11 @@ class Experiment:
         self._position.terminal(f"Cycle {experiment['cycles']} Started")
         yield from self._outputs.set_on("Stir", 0)
         yield SETTLE_S
-        if experiment["ON"] == 0:
-            yield from self._cut_short()
-            return
-        yield from self._measure()
-        if experiment["ON"] == 0:  # `Measuring` stays 1 (docs/device.md, Cycle)
-            yield from self._cut_short()
+        if experiment["ON"] != 0:
+            yield from self._measure()
+        if experiment["ON"] == 0:  # it does not count, and `Measuring` stays 1 (docs/device.md, Cycle)
+            experiment["cycles"] -= 1
+            yield from self._finish()
             return
         data["OD"]["Measuring"] = 0
         yield from self._act()

@@ -80,8 +80,7 @@ PLANT = {  # fault: part of the plant, its switch
     "fp_dead": ("fluorescence", "dead"),
     "fp_saturated": ("fluorescence", "saturated"),
 }
-SIGNED = {"clock_step", "od_offset", "od_jump", "lost_request", "lost_reply", "reset_before", "reset_after"}
-SIGNED |= {"malformed", "truncated", "lying"}  # counts may be -1
+SIGNED = {"clock_step", "od_offset", "od_jump"}
 
 
 def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float = 1.0) -> None:
@@ -94,9 +93,10 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
         raise ValueError(f"fault = {name}: allowed {', '.join(FAULTS)}")
     if reactor != "all" and reactor not in device.vials:
         raise ValueError(f"reactor = {reactor}: allowed all, {', '.join(device.vials)}")
-    if value != value or (value < 0.0 and name not in SIGNED):
-        raise ValueError(f"{name} = {value}: allowed {FAULTS[name][1]}")
-    kind = FAULTS[name][0]
+    kind, allowed, _ = FAULTS[name]
+    signed = name in SIGNED or (kind, allowed) == ("board", "count")  # these counts may be -1
+    if value != value or (value < 0.0 and not signed):
+        raise ValueError(f"{name} = {value}: allowed {allowed}")
     names = tuple(device.vials) if reactor == "all" else (reactor,)
     now = device.computer.now()
     if kind == "act":

@@ -1,12 +1,11 @@
 """An emulated device of one's own: `python -m hardware.emulator` as a child process on a free port."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 from hardware.errors import LinkError
 
@@ -15,7 +14,7 @@ __all__ = ["EmulatorProcess"]
 START_S = 60.0
 
 
-class EmulatorProcess:
+class EmulatorProcess(AbstractContextManager["EmulatorProcess"]):
     """Starts the emulator and ends it again; use as a context manager. If this process is killed, it ends as well.
 
     Args:
@@ -53,9 +52,6 @@ class EmulatorProcess:
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
-
-    def __enter__(self) -> EmulatorProcess:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -125,10 +124,10 @@ class EmulatorServer:
                     software = {"alive": s.alive, "restarts": s.restarts, "exits": s.exits}
                     seen = {"selected": s.worker.software.selected, "errors": list(device.computer.errors)}
                     return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
-                if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.vials]:
-                    return 200, _json([row._asdict() for row in getattr(device.vials[parts[1]], parts[0])])
-                if method == "GET" and parts[0] == "reads" and parts[1:] in [[m] for m in device.vials]:
-                    return 200, _json(list(device.vials[parts[1]].reads))
+                kept = method == "GET" and parts[0] in ("doses", "samples", "reads")
+                if kept and parts[1:] in [[m] for m in device.vials]:
+                    rows = getattr(device.vials[parts[1]], parts[0])
+                    return 200, _json([row if isinstance(row, float) else row._asdict() for row in rows])
                 if method == "GET" and parts == ["faults"]:
                     return 200, _json({name: list(entry) for name, entry in FAULTS.items()})
             except ValueError as problem:
@@ -238,12 +237,7 @@ def parser() -> argparse.ArgumentParser:
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
     add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
     for pump in SPARE:
-        add(
-            f"--{pump.lower()}-flow",
-            type=float,
-            default=0.0,
-            help=f"{pump} supplies a second fluid, mL/s (default: no)",
-        )
+        add(f"--{pump.lower()}-flow", type=float, default=0.0, help=f"{pump} gives a second fluid, mL/s (default: no)")
     add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
     add(
         "--pump-start",
@@ -292,9 +286,8 @@ def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDe
 def main(argv: Sequence[str] | None = None) -> int:
     """Run until SIGINT or SIGTERM; exit status."""
     arguments = parser().parse_args(argv)
-    control = arguments.control_port
-    if control is None:
-        control = arguments.port + 1 if arguments.port else 0
+    beside = arguments.port + 1 if arguments.port else 0
+    control = beside if arguments.control_port is None else arguments.control_port
     try:
         for key, port in (("port", arguments.port), ("control-port", control)):
             if not 0 <= port <= 65535:
@@ -308,16 +301,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"emulator: {problem}")
         return 2
 
-    def end(number: int, frame: FrameType | None) -> None:
-        server.stop()
-
     def orphaned() -> None:
         while os.read(0, 4096):  # nothing, when the process that holds the other end is gone, however it went
             pass
         server.stop()
 
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: server.stop())
     if arguments.until_eof:
         threading.Thread(target=orphaned, daemon=True).start()
     print(

@@ -97,8 +97,6 @@ class SerialTransport(Transport):
 
     def switched_off(self) -> SwitchedOff:
         """Ask the agent what it has switched off. Raises: LinkError, ProtocolError."""
-        if self._line is None:
-            self._open()
         return switched_off(self._exchange("PING", "/").body, self._clock)
 
     def _open(self) -> None:
@@ -138,8 +136,6 @@ class SerialTransport(Transport):
             self._line = None
 
     def _request(self, method: str, path: str) -> Reply:
-        if self._line is None:
-            self._open()
         reply = self._exchange(method, path)
         if reply.status >= 100:
             return reply
@@ -150,6 +146,8 @@ class SerialTransport(Transport):
 
     def _exchange(self, method: str, path: str) -> Reply:
         """One request, repeated under the same ID until a whole reply came. Raises: LinkError, ProtocolError."""
+        if self._line is None:
+            self._open()
         assert self._line is not None
         self._count = (self._count + 1) % 2**16
         number = self._session << 16 | self._count

@@ -158,11 +158,7 @@ class TransportConfig:
     )
     read_s: float = setting(20.0, "for a whole answer of the device", "s", above=0.0, below=30.0)
     floor_s: float = setting(
-        1.0,
-        "in real seconds no time-out is shorter than this, however fast an emulator runs",
-        "s",
-        above=0.0,
-        below=30.0,
+        1.0, "no time-out is shorter in real seconds, however fast an emulator runs", "s", above=0.0, below=30.0
     )
     port: str = setting("/dev/ttyACM0", "serial device of this computer")
     token_file: str = setting(

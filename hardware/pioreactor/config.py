@@ -90,8 +90,8 @@ class PioreactorConfig:
     def of(self, unit: str) -> "PioreactorConfig":
         """As one unit has it: its own values in the place of those for all."""
         own = self.units.get(unit, UnitConfig())
-        given = {key: getattr(own, key) for key in ("channel", "od_zero", "od_scale")}
-        return replace(self, **{key: value for key, value in given.items() if value is not None})
+        keys = [key for key in ("channel", "od_zero", "od_scale") if getattr(own, key) is not None]
+        return replace(self, **{key: getattr(own, key) for key in keys})
 
     def address(self, unit: str) -> str:
         """Of a unit's web server."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from hardware.pioreactor.config import vial_ml
-from hardware.pioreactor.mailbox import ALT, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
+from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
 from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
 from hardware.stations import Plan
 from hardware.storage import history as history_of
@@ -87,10 +87,7 @@ class Doses:
             self._course = self._drained(self._look_for(history, plan), plan, history.id)
 
     def plan(self, rate: float, pump: int = 1) -> Plan:
-        """Plan the dose of a mean rate, mL; only the feed's carries over. Raises: ValueError.
-
-        Args: rate: mL/s over a control period, >= 0. pump: number of the pump that gives it.
-        """
+        """Plan the dose of a period, mL, by mean rate, mL/s, and number of its pump. Raises: ValueError."""
         if not (rate >= 0.0 and math.isfinite(rate)):
             raise ValueError(f"pump rate = {rate} mL/s: allowed finite numbers >= 0")
         carries = rate > 0.0 and pump != SPARE
@@ -126,7 +123,7 @@ class Doses:
             return "no new sample"
         if self.running:
             return "the previous dose has not ended"
-        if self.pumps.box.on() or any(self.pumps.box.live(job) for job in DOSING_JOBS):
+        if self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS):
             return "a pump or a dosing job of somebody else runs"
         return ""
 
@@ -267,8 +264,8 @@ class Doses:
         """
         beside_ml = (self.pumps.pins[WASTE].ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
         for job in self.pumps.jobs:
-            pin, now = self.pumps.pins[job], self._clock.now()
-            if self.pumps.odd(job) or not (pin.on or self.pumps.box.driven(job) or now < pin.off_s + SETTLE_S):
+            pin, box, now = self.pumps.pins[job], self.pumps.box, self._clock.now()
+            if self.pumps.odd(job) or not (pin.on or box.live(job, *AUTOMATIONS) or now < pin.off_s + SETTLE_S):
                 ran_ml = (pin.ran_s - self._ran_s[job]) * self.pumps.flow_ml_s[job] - self._strange_ml[job]
                 self._ran_s[job], self._strange_ml[job] = pin.ran_s, 0.0
                 if ran_ml > LATE_ML:

@@ -23,7 +23,8 @@ SPARE = 3  # number of the alt-media pump
 NUMBERS = {MEDIA: 0, ALT: SPARE, WASTE: 0}  # of spare pumps, as records have them
 AUTOMATIONS = ("circulate_media", "circulate_alt_media", "pumps", "dosing_automation")  # drive several pumps
 DOSING_JOBS = (*PUMPS, *AUTOMATIONS)
-LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
+LIVE = ("init", "ready", "sleeping")
+WORDS = (*LIVE, "disconnected", "lost")  # the last is the broker's: the job was killed, stands still, or left it
 ECHOES = ("stirring", "temperature_automation")  # jobs that say all pins of the unit now and then
 CHANNELS = {"1": 17, "2": 13, "3": 16, "4": 12, "5": 18}  # GPIO pin of each PWM channel of the vendor's board
 TWICE_S = 0.2  # two messages that are not of the same instant
@@ -147,9 +148,9 @@ class Mailbox:
             said = json.loads(payload or b"{}")
             said = {CHANNELS.get(k, 0): dc for k, dc in said["channels"].items()} if "channels" in said else said
             duty = {int(pin): _number(dc) for pin, dc in said.items()}
-            echoes = not mine or any(map(self.live, ECHOES))
+            echoes = not mine or self.live(*ECHOES)
             for job, number in self.jobs.items():
-                word = LIVE[0] if self.driven(job) else self.state(job).word
+                word = LIVE[0] if self.live(job, *AUTOMATIONS) else self.state(job).word
                 on = duty.get(number, 0.0) > 0.0
                 self.pins[job].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
             self.dc_s = max(self.dc_s, at)
@@ -222,15 +223,11 @@ class Mailbox:
         """Return what a job of our experiment last said."""
         return self.states.get((self._experiment, job), State())
 
-    def live(self, job: str) -> bool:
-        """Whether a job of this name is there: in our experiment, or heard of in another one since we listen."""
+    def live(self, *jobs: str) -> bool:
+        """Whether a job of these names is there: in our experiment, or heard of in another one since we listen."""
         with self.lock:
-            known = [(s, e == self._experiment) for (e, name), s in self.states.items() if name == job]
+            known = [(s, e == self._experiment) for (e, name), s in self.states.items() if name in jobs]
         return any(s.word in LIVE and (mine or s.at > -math.inf) for s, mine in known)
-
-    def driven(self, job: str) -> bool:
-        """Whether a job is there that drives a pump: its own, or one that drives several."""
-        return any(map(self.live, (job, *AUTOMATIONS)))
 
     def on(self) -> list[str]:
         """Jobs whose pumps run by what the unit said last."""

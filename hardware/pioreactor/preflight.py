@@ -2,17 +2,15 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
 from hardware.family import Check
-from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS, NAMES
 from hardware.pioreactor.pumps import STEP_S
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import UNHEARD, PioreactorStation
-from hardware.pioreactor.versions import TESTED, facts
+from hardware.pioreactor.versions import TESTED, facts, flow
 from hardware.pioreactor.web import Barrier, NotHeard, Web
 
 __all__ = ["preflight"]
@@ -54,7 +52,11 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
         except ReactorError as error:
             detail, _, remedy = str(error).partition("; ")
             yield Check(f"{name} {pump}", False, detail, remedy)
-    settings = _settings(name, web, unit.leader)
+    try:
+        settings = web.get("/config/merged")
+    except NotHeard:  # an older version, of which the leader knows
+        settings = unit.leader.get(f"/workers/{name}/configuration", below="/api").get(name)
+    settings = settings if isinstance(settings, dict) else {}
     norm = str(settings.get("od_reading.config", {}).get("ref_normalization", "classic"))
     scaled = norm == "classic" or config.od_scale != 1.0 or any(device.startswith("od") for device in calibrations)
     remedy = "calibrate OD, give backend.od_scale, or set it to classic in the vendor's page"
@@ -79,7 +81,12 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
     word = f"on the unit {forget} --job-name {dosing[0]}" if forget and dosing else "the unit is rebooted"
     remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
-    yield _queue(name, web)
+    clock = RealClock()
+    barrier = Barrier(web, clock)  # a request that only prints help
+    while not (passed := barrier.passed()) and clock.now() < QUEUE_S:
+        clock.sleep(STEP_S)
+    seen = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
+    yield Check(f"{name} task queue", passed, seen, "on the unit: sudo systemctl restart huey")
     if experiment.ok:  # of another one it tells us nothing
         for _ in station.hear_pins():
             unit.real.sleep(STEP_S)
@@ -95,22 +102,3 @@ def _experiment(name: str, wanted: str, leader: Web) -> Check:
     except NotHeard as error:
         return Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
     return Check(f"{name} experiment", not why, f"{why or 'active'}, backend.experiment = {wanted}", remedy)
-
-
-def _settings(name: str, web: Web, leader: Web) -> dict[str, Any]:
-    """Read the unit's configuration by section: newer versions tell it themselves. Raises: ReactorError."""
-    try:
-        found = web.get("/config/merged")
-    except NotHeard:
-        found = leader.get(f"/workers/{name}/configuration", below="/api").get(name)
-    return found if isinstance(found, dict) else {}
-
-
-def _queue(name: str, web: Web) -> Check:
-    """Whether the task queue takes what is written down, by a request that only prints help."""
-    clock = RealClock()
-    barrier = Barrier(web, clock)
-    while not (passed := barrier.passed()) and clock.now() < QUEUE_S:
-        clock.sleep(STEP_S)
-    detail = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
-    return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")

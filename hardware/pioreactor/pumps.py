@@ -17,9 +17,8 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ReactorError
 from hardware.logbook import Logbook
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.jobs import flow
-from hardware.pioreactor.mailbox import MEDIA, NAMES, PUMPS, WASTE, Cluster, Mailbox
-from hardware.pioreactor.versions import Facts
+from hardware.pioreactor.mailbox import AUTOMATIONS, MEDIA, NAMES, PUMPS, WASTE, Cluster, Mailbox
+from hardware.pioreactor.versions import Facts, flow
 from hardware.pioreactor.web import PROBE_S, Barrier, Calls, NotHeard, Web
 
 __all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "Unit", "boot_of", "is_off"]
@@ -126,15 +125,12 @@ class Pumps:
         self.ours = f"{OURS}{unit.run}/"
         self.short = f"{self.ours}{unit.name}/off"
 
-    def lost(self, job: str) -> bool:
-        """Whether a job ended without a word, or stands still: its process was killed, frozen, or lost the broker."""
-        return self.box.state(job).word == "lost"
-
     def odd(self, job: str) -> bool:
         """Whether a pump has to be ended: it runs without a job, or its job was lost and it is not proven off since."""
-        pin, new = self.pins[job], self.box.state(job).at > self.proven.get(job, -math.inf) or job not in self.proven
-        runs_on = pin.on and not self.box.driven(job) and self.clock.now() > max(pin.on_s, pin.ended_s) + SETTLE_S
-        return runs_on or (self.lost(job) and new)
+        pin, state, now = self.pins[job], self.box.state(job), self.clock.now()
+        settled = now > max(pin.on_s, pin.ended_s) + SETTLE_S
+        new = state.at > self.proven.get(job, -math.inf) or job not in self.proven
+        return (pin.on and settled and not self.box.live(job, *AUTOMATIONS)) or (state.word == "lost" and new)
 
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:
         """Whether the unit was started again, by its list of running jobs."""
@@ -243,7 +239,7 @@ class Pumps:
         fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
         while not (
             why or self.said(request) > 0.0 or self.pins[job].on or self.pins[job].on_s >= asked_s
-            or (self.lost(job) and self.box.state(job).at >= asked_s)
+            or (self.box.state(job).word == "lost" and self.box.state(job).at >= asked_s)
         ):  # fmt: skip
             now, state, taken = self.clock.now(), self.box.state(job), None
             if now > asked_s + self.config.start_s and not (late or self.box.live(job)):
@@ -299,10 +295,7 @@ class Pumps:
         return Moved(low, max(high, round(ran_ml, 4)), end)  # a job times itself, and on a busy unit it does that late
 
     def end(self, request: Request) -> Steps[Moved]:
-        """End a pump that has begun, or may have, until it is proven off; what it moved (docs/pioreactor.md, Ending).
-
-        What only a hand can do is said; once it was done, what is tried here ends the pump.
-        """
+        """End a pump that has begun, or may have, until it is proven off; return what it moved."""
         job, ending, pin = request.job, ForcedEnd(self, request), self.pins[request.job]
         while math.isnan(off_s := ending.off_s()):
             ending.act()
@@ -322,7 +315,7 @@ class Pumps:
             self.waits = late or self.waits
             if job != WASTE:
                 self.flowed_ml = ending.flowed() if heard else 0.0
-                drain = late or (self.lost(job) and pin.on) or self._beyond(request) > 0.0
+                drain = late or (self.box.state(job).word == "lost" and pin.on) or self._beyond(request) > 0.0
                 self.runs_on = self.flowed_ml > 0.0 and drain
             yield STEP_S
         self.trouble, self.waits, self.runs_on = "", False, False
@@ -353,11 +346,9 @@ def is_off(seen: Seen) -> bool:
 
 
 class ForcedEnd:
-    """One pump on its way to being proven off: what is tried, and what proves it.
+    """One pump on its way to being proven off: what is tried, and what proves it (docs/pioreactor.md, Ending).
 
-    The job is asked by MQTT and by HTTP, stirring to say all pins again. A short run of the same pump sets its pin to 0
-    if no lock forbids that; its events are booked as anybody's. Each is tried again at its own pace; of short runs at
-    most `SHORTS` are carried out, and none is asked for while an earlier one may still wait.
+    Of short runs at most `SHORTS` are carried out, and none is asked for while an earlier one may still wait.
     """
 
     def __init__(self, pumps: Pumps, request: Request) -> None:
@@ -441,10 +432,7 @@ class ForcedEnd:
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
-        """Return what a pump moved up to now that runs on, or reported a start and no end, mL.
-
-        0 for a pump whose bottle is empty by now.
-        """
+        """Return what a pump that runs on, or told no end, moved up to now, mL; 0 once its bottle is empty."""
         p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s

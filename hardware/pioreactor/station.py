@@ -10,11 +10,10 @@ from contextlib import suppress
 
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.doses import Doses, UnitHistory
-from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, regulates, request, target_of
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
-from hardware.pioreactor.versions import facts
+from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts, regulates, request, target_of
 from hardware.pioreactor.web import Barrier, Calls
 from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
@@ -228,9 +227,7 @@ class PioreactorStation:
             silent_s = self._clock.now() - self.sampling.read_s
             if silent_s < longest_s or silent_s > self._clock.of_real(SILENT_S):
                 return silent_s < longest_s
-        state = self._box.state(job)
-        known = state.at > -math.inf or not state.word
-        return self._box.live(job) if state.word and known else job in self._listed
+        return self._box.live(job) if self._box.state(job).at > -math.inf else job in self._listed
 
     def _keep(self, job: str) -> None:
         """Ask for a job again that should run and does not, once if it said itself that it ended."""

@@ -27,12 +27,6 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Ruling", "kinds_of"]
 
-SAID = memory.Words(
-    "saved interlock: {value}, expected its fields", "saved interlock: {key} = {value}: expected {what}",
-    "saved interlock: {key} has the shape {found}, expected {shape}",
-    "saved interlock is for {k} reactors, this run has {n}",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Ruling:
@@ -228,12 +222,12 @@ class Interlock:
         Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
         if isinstance(state, dict) and (other := set(state) ^ set(self.state())):
-            raise ValueError(f"saved interlock has other fields: {', '.join(sorted(other))[:80]}")
+            raise ValueError(f"interlock: its saved state has other fields: {', '.join(sorted(other))[:80]}")
         for part in (*self._parts, self):
-            memory.restore(part, state, SAID)
+            memory.restore(part, state, "interlock")
         for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
             if not np.isin(getattr(self, key), np.array(codes)).all():
-                raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
+                raise ValueError(f"interlock.{key}: {state[key]}, no such code")
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@
 feed_low_ml at least), and by which pump where that is not the feed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 from hardware.errors import RecordingError
 from hardware.storage.journal import REMEDY
@@ -100,7 +98,7 @@ class Ending:
         return {"verified_off": True, "repeated_ml": self.repeated_ml, **known}
 
     @classmethod
-    def of_row(cls, row: Mapping[str, Any]) -> Ending:
+    def of_row(cls, row: Mapping[str, Any]) -> Self:
         """Invert `row`. Raises: KeyError, TypeError, ValueError for a damaged row."""
         on_s, feed_ml, waste_ml = (float(row[key]) for key in ("on_s", "feed_ml", "waste_ml"))
         last = (float(row.get(key, math.nan)) for key in ("feed_last_ml", "waste_last_ml", "feed_low_ml"))

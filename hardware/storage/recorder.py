@@ -4,12 +4,11 @@ A recording is a CSV: one row per control period, units in the header, OD measur
 from that row to the next. Neither a crash nor a power cut costs more than the row being written.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from hardware.errors import RecordingError
@@ -20,7 +19,7 @@ __all__ = ["Recorder"]
 Value = float | int | str | bool | None
 
 
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """Append-only CSV writer: what `write` returned from is on the disk.
 
     Each row is one `write` on an O_APPEND descriptor, then fsync. An existing file is continued: a last line torn by a
@@ -82,9 +81,6 @@ class Recorder:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-    def __enter__(self) -> Recorder:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()

@@ -126,7 +126,7 @@ def test_a_midpoint_law_that_has_begun_does_not_turn_back_nor_does_one_that_is_r
     """From .3 to .7 in 90 min is late, and from .5 in 85 min early: one that had not begun would warm it."""
     begun, resumed, other = law("midpoint"), law("midpoint"), law("midpoint")
     assert begun.act(seen(logit(0.3)), asked(0.3, 0.7, 90.0), *at(0))[0] == 29.0
-    memory.restore(resumed, json.loads(json.dumps(memory.save(begun))), memory.words("composition"))
+    memory.restore(resumed, json.loads(json.dumps(memory.save(begun))), "composition")
     targets = [each.act(seen(0.0), asked(0.3, 0.7, 85.0), *at(5))[0] for each in (begun, resumed, other)]
     assert targets == [29.0, 29.0, 36.0]
 

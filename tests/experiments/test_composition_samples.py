@@ -161,7 +161,7 @@ def test_a_resumed_run_that_is_told_its_past_is_one_that_was_not_interrupted(hou
         getattr(stopped, method)(*arguments)
     again = Recall(CompositionEstimator(CONFIG))
     again.reset(2)
-    memory.restore(again, json.loads(json.dumps(memory.save(stopped))), memory.words("composition"))
+    memory.restore(again, json.loads(json.dumps(memory.save(stopped))), "composition")
     keys = ("time_min", "od", "fluorescence", "temperature_degc", "believed", "volume_ml")
     rows: list[dict[str, list[float]]] = [{key: [] for key in keys} for _ in range(2)]
     for minute, method, arguments in events[:cut]:

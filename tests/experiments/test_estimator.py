@@ -288,5 +288,5 @@ def test_everything_that_it_remembers_matters(forgotten: str) -> None:
     if forgotten:
         kept[forgotten] = memory.save(estimator())[forgotten]
     e = estimator()
-    memory.restore(e, kept, memory.words("estimator"))
+    memory.restore(e, kept, "estimator")
     assert (next_readings(e) == next_readings(busy(bend))) is not bool(forgotten)

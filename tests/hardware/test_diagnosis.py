@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.diagnosis import diagnose, fault_of
-from hardware.chibio.onboard_regulation import regulates
+from hardware.chibio.diagnosis import diagnose, fault_of, regulates
 from hardware.chibio.protocol import DeviceState, parse_state
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from tests.hardware.script import state

@@ -383,4 +383,4 @@ def test_of_two_commands_that_were_given_up_each_is_looked_for(supplied):
     supplied.clock.sleep(60.0)
     supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), "", "Pump3")
     supplied.run(60.0)
-    assert [supplied.doses._may_be_late(pump) for pump in ("Pump1", "Pump3", "Pump4")] == [True, True, False]
+    assert [pump in supplied.doses._given_up for pump in ("Pump1", "Pump3", "Pump4")] == [True, True, False]

@@ -83,7 +83,7 @@ def test_ranges_of_a_pump(key: str, low: float, high: float) -> None:
     for value in (low, high):
         PumpCalibration(**{key: value})
     for value in (low - 1e-6, high + 1e-6, np.nan):
-        with pytest.raises(ValueError, match=f"pump calibration {key} = .*: allowed {low} to {high}; weigh"):
+        with pytest.raises(ValueError, match=rf"pump calibration.{key} = .*: allowed {low:g} to {high:g}"):
             PumpCalibration(**{key: value})
 
 
@@ -180,7 +180,7 @@ def test_a_stored_calibration_reads_back() -> None:
     pump = PumpCalibration(0.9, 0.05, 0.08, 0.4, "2026-02-03", "1000200030004000")
     assert PumpCalibration.from_dict({**asdict(pump), "weighings": []}) == pump
     for wrong in (70.0, None, "fast"):
-        with pytest.raises(ValueError, match=r"flow_ml_s|pump calibration.*weigh|fast"):
+        with pytest.raises(ValueError, match="pump calibration.flow_ml_s"):
             PumpCalibration.from_dict({"flow_ml_s": wrong})
 
 

@@ -210,7 +210,7 @@ def test_edges_rise_from_nought_and_are_saved_without_what_pads_them(edges: list
 def test_there_is_one_row_for_each_reactor(key: str) -> None:
     state = written(unused("pi"))
     for rows in ([], state[key][:1], [*state[key], state[key][0]], "rows", [None, None]):
-        refused("pi", state | {key: rows}, f"{key}: ")
+        refused("pi", state | {key: rows}, f"{key}: ", f"{key}.")
 
 
 @pytest.mark.slow

@@ -19,11 +19,10 @@ from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.doses import replay
 from hardware.pioreactor.family import FAMILY
-from hardware.pioreactor.jobs import flow, regulates, request
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import UNHEARD
-from hardware.pioreactor.versions import TESTED, facts
+from hardware.pioreactor.versions import TESTED, facts, flow, regulates, request
 from hardware.pioreactor.web import Web
 from hardware.rig import family as rig
 from tests.hardware.pioreactor_lab import UNIT, Lab, World, sampled
