@@ -11,7 +11,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 __all__ = [
-    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owner", "place",
+    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owners", "place",
     "program", "sentence",
 ]  # fmt: skip
 
@@ -112,15 +112,15 @@ def chosen(command: str) -> dict[str, str | None]:
     return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
 
 
-def owner(name: str) -> str | None:
-    """Return the command that a recipe is for (line `# @command NAME`); None for a preset that serves any command.
+def owners(name: str) -> tuple[str, ...]:
+    """Return the commands that a recipe is for (line `# @command NAME,NAME`), () for a preset that serves any command.
 
     Args: name: group and option, "experiment/paper".
     """
     if name in _added:
-        return None
-    found = re.search(r"^# @command (\w+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
-    return found[1] if found else None
+        return ()
+    found = re.search(r"^# @command ([\w,]+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+    return tuple(found[1].split(",")) if found else ()
 
 
 def companion(name: str) -> str | None:
@@ -137,7 +137,7 @@ def companion(name: str) -> str | None:
 
 def options(command: str, group: str) -> list[str]:
     """List the presets of a group that a command accepts."""
-    return [option for option in groups()[group] if owner(f"{group}/{option}") in (None, command)]
+    return [option for option in groups()[group] if command in (owners(f"{group}/{option}") or (command,))]
 
 
 def load(name: str) -> dict[str, Any]:

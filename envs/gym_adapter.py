@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv, checked_actions
+from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv
 
 __all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 
@@ -55,13 +55,13 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     def _info(self) -> dict[str, Any]:
         return dict(zip(self._batch.names, self._batch.state[0].tolist(), strict=False))
 
-    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
 
-        Raises: ValueError for an action outside the grid, or that is not one integer; RuntimeError before a reset.
+        Raises: ValueError for an action outside the grid, or that is not one number of it; RuntimeError before a reset.
         """
-        index = checked_actions(action, (), self.config.n_actions)
-        observation, reward, _, truncated, infos = self._batch.step(index[None])
+        index = self._batch.checked(action, ())
+        observation, reward, _, truncated, infos = self._batch.step(index.reshape(self._batch.action_space.shape))
         info = self._info()
         if truncated[0]:
             self._next, observation = observation[0], infos["final_obs"]

@@ -92,8 +92,8 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
         span, (low, high) = self.config.largest_error, self.config.growth_shares
         return np.stack([span * (2.0 * numbers[:, 0] - 1.0), low + (high - low) * numbers[:, 1]], axis=1)
 
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        self.state[:, 0] += self.state[:, 1] - self._levels[actions]
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        self.state[:, 0] += self.state[:, 1] - (actions if self.continuous else self._levels[actions])
         reward: Array = relative_reward(self.state[:, 0])
         return reward
 

@@ -75,7 +75,7 @@ class Scenario:
             phases > 0 and set(beside) == {phases},
             "scenario.setpoints, minutes, temperatures",
             "lists of {}, {} and {}".format(*lengths),
-            "one or more setpoints, and an entry of minutes and of temperatures for each of them",
+            "one or more setpoints, and as many minutes and temperatures; decimals have a point: 0.5",
         )
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))

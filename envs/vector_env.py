@@ -110,6 +110,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
       num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
       render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
+      continuous: actions are numbers from 0 to 1, shape (N, 1), in the place of indices: anywhere on the grid's range.
     Raises: ValueError naming what is not allowed, or a value that the task does not have and those it has; TypeError
       for a `render_mode`.
     """
@@ -131,6 +132,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
+        continuous: bool = False,
         **overrides: Any,
     ) -> None:
         if config is None:
@@ -148,7 +150,9 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         self.num_envs = num_envs
         self.render_mode = None
         self.single_observation_space = self.observations(self.config)
-        self.single_action_space = spaces.Discrete(self.config.n_actions)
+        self.continuous = continuous
+        share = spaces.Box(0.0, 1.0, (1,), np.float32)
+        self.single_action_space = share if continuous else spaces.Discrete(self.config.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state = np.ones((num_envs, *self.single_observation_space.shape))
@@ -170,8 +174,8 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """State (K, O) of new episodes from uniform numbers, (K, numbers)."""
 
     @abstractmethod
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        """Change `state` by one control period; the rewards (N,)."""
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        """Change `state` by one control period; the rewards (N,). Args: actions: indices, or numbers from 0 to 1."""
 
     def _weigh(self, last: Array) -> Array:
         """Rewards of the last steps of episodes, (K,)."""
@@ -239,7 +243,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control period in every copy.
 
-        Args: actions: indices of pump rates, shape (N,), integers.
+        Args: actions: indices of the action grid, shape (N,), integers; `continuous`: numbers from 0 to 1, (N, 1).
         Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
           where an episode ended, infos["final_obs"] (N, O) holds its last observation and infos["_final_obs"] (N,)
           says where.
@@ -247,8 +251,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """
         if self._streams is None:
             raise RuntimeError("step before reset: call reset(seed=...) first")
-        actions = checked_actions(actions, (self.num_envs,), self.config.n_actions)
-        reward = self._advance(actions)
+        reward = self._advance(self.checked(actions, (self.num_envs,)))
         self._steps += 1
         if self._waiting.any():
             reward[self._waiting] = 0.0
@@ -256,6 +259,15 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         truncated = self._steps >= self.config.episode_steps
         infos = self._end(truncated, reward) if truncated.any() else {}
         return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
+
+    def checked(self, actions: Any, copies: tuple[int, ...]) -> NDArray[Any]:
+        """Check actions, indices or numbers from 0 to 1; returns the shape of `copies`. Raises: ValueError."""
+        if not self.continuous:
+            return checked_actions(actions, copies, self.config.n_actions)
+        given = np.asarray(actions, dtype=np.float64)
+        fits = given.shape == (*copies, 1) and bool(np.all((given >= 0.0) & (given <= 1.0)))
+        require(fits, "action", reprlib.repr(given.tolist()), f"numbers from 0 to 1, shape {(*copies, 1)}")
+        return given[..., 0]
 
     def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
         """Weigh the last reward of ended episodes, in place, and begin the next ones or let them wait; the infos."""
@@ -330,8 +342,10 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
         setpoint = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
         return np.stack([low + (high - low) * numbers[:, 0], setpoint], axis=1)
 
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        np.minimum(self.od * self._factors[actions], MAX_OD, out=self.od)
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        rates = actions * self.config.max_pump_rate
+        factors = step_factors(self.config, rates) if self.continuous else self._factors[actions]
+        np.minimum(self.od * factors, MAX_OD, out=self.od)
         return tracking_reward(self.od, self.setpoint)
 
     def _weigh(self, last: Array) -> Array:
