@@ -42,7 +42,7 @@ class Connection:
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
     the answer names this reactor and its pinned identity (docs/device.md, Selection). A command is sent only if the
     last verified read saw this reactor present: one request to an absent one ends the whole server (docs/device.md,
-    Absent reactors). After a request without an answer, or `SEEN_S` without a request, the next command looks first.
+    Failures). After a request without an answer, or `SEEN_S` without a request, the next command looks first.
 
     Args:
       name: position, M0 to M7. permitted: what this client may send.
