@@ -26,15 +26,15 @@ class Bench:
     Raises: ValueError naming key, value and allowed range.
     """
 
-    volume_ml: float = setting(20.0, "culture up to the waste tube", "mL", within=WITHIN_ML)
+    volume_ml: float = setting(20.0, "culture volume up to the waste tube", "mL", within=WITHIN_ML)
     volumes_ml: dict[str, float] = setting(
-        {}, "of single reactors whose tube ends elsewhere, e.g. bench.volumes_ml.M1=14", "mL"
+        {}, "volume of single reactors that differ, e.g. bench.volumes_ml.M1=14", "mL"
     )
-    period_s: float = setting(60.0, "control period: from a sample and its dose to the next", "s", within=(1, 3600))
+    period_s: float = setting(60.0, "control period: from one sample and its dose to the next", "s", within=(1, 3600))
     max_rate: float = setting(
-        0.02, "largest feed rate; the Chi.Bio's own regulator has this cap", "mL/s", above=0.0, at_most=0.05
+        0.02, "largest pump rate; the Chi.Bio's own regulator has this limit", "mL/s", above=0.0, at_most=0.05
     )
-    bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
+    bottle_ml: float = setting(2000.0, "fresh medium per reactor at the start", "mL", above=0.0, below=math.inf)
 
     def __post_init__(self) -> None:
         check(self, "bench")

@@ -30,15 +30,15 @@ Array = NDArray[np.float64]
 class RelativeConfig:
     """`env=relative`: the task e' = e + s - v. Raises: ValueError naming key, value and allowed range."""
 
-    kind: str = setting("relative", "which task")
-    n_actions: int = setting(17, "shares of the largest pump rate, equally spaced on [0, 1]", within=(2, 1001))
+    kind: str = setting("relative", "task")
+    n_actions: int = setting(17, "number of pump rates, equally spaced from 0 to the largest", within=(2, 1001))
     episode_steps: int = setting(20, "control steps per episode, ended by truncation", at_least=1)
     growth_shares: tuple[float, float] = setting(
         (0.05, 0.98), "range of s, drawn uniformly per episode", above=0.0, at_most=1.0, interval=True
     )
     largest_error: float = setting(
         1.2,
-        "episodes begin within plus and minus this; further off the pump runs at full rate or not at all",
+        "episodes start within +- this error; beyond it the pump runs at full rate or not at all",
         "periods of full pump",
         within=(1.1, 100),
     )

@@ -27,46 +27,46 @@ class Scenario:
     `temperatures` holds. Raises: ValueError naming key, value and allowed range.
     """
 
-    setpoints: tuple[float, ...] = setting((0.5,), "one of each phase", "OD", above=0.0, at_most=1.5)
+    setpoints: tuple[float, ...] = setting((0.5,), "setpoint of each phase", "OD", above=0.0, at_most=1.5)
     minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
     temperatures: tuple[float | None, ...] = setting(
-        (37.0,), "thermostat in each phase; null, with two species: where both grow alike", "degC", within=(15, 42)
+        (37.0,), "thermostat in each phase; null, two species: where both grow alike", "degC", within=(15, 42)
     )
     recovery_od: float = setting(
-        0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
+        0.0, "OD to which the culture grows undiluted before the first phase; 0: no recovery", "OD", within=(0, 1.5)
     )
-    recovery_limit_min: float = setting(600.0, "how long that may take", "min", above=0.0)
+    recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
     ratios: tuple[float | None, ...] = setting(
         (),
-        "share of the second species in each phase, null where none is asked for; empty: in no phase",
+        "setpoint of the share of B in each phase, null for none; empty: in no phase",
         above=0.0,
         below=1.0,
     )
     ratio_sine: tuple[float, ...] = setting(
-        (), "in place of ratios a sine that falls first: mean, amplitude and period in min; empty: none"
+        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
     )
     announce_min: float | None = setting(
         None,
-        "how long ahead the controllers know of a change of the setpoint or the share; 0: never; null: 360 where a "
-        "share is asked for, else 0",
+        "time by which controllers know a change of setpoint in advance; 0: never; null: 360 with a composition, else "
+        "0",
         "min",
         within=(0, 1440),
     )
     until: tuple[str | None, ...] = setting(
         (),
-        "what ends each phase before its minutes are over: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: nothing",
+        "condition that ends a phase early: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: none",
     )
     outputs: tuple[str | None, ...] = setting(
         (),
-        "what each phase gives by a spare pump: 'pump3 2 mL/h', 'pump4 1.5 mL' at its start, or null; empty: nothing",
+        "spare pump in each phase: 'pump3 2 mL/h', 'pump4 1.5 mL' at its start, or null; empty: none",
     )
     settled_band: float = setting(
         0.05,
-        "settled: |OD - setpoint| within this share of the setpoint, as the settling time of the summary",
+        "settled: |OD - setpoint| within this fraction of the setpoint, as for the settling time of the summary",
         "",
         within=(0.005, 0.5),
     )
-    settled_min: float = setting(10.0, "and so for so long without a reading outside", "min", within=(1, 1440))
+    settled_min: float = setting(10.0, "time without a reading outside that band", "min", within=(1, 1440))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))

@@ -57,14 +57,14 @@ class EnvConfig:
         note="20 mL and a 1 mL/s pump: 0.333",
     )
     control_min: float = setting(1.0, "control period (paper)", "min", above=0.0, at_most=60.0)
-    integrator: str = setting("euler", "the paper names no scheme", choices=tuple(INTEGRATORS))
+    integrator: str = setting("euler", "integration scheme (not stated in the paper)", choices=tuple(INTEGRATORS))
     substeps: int = setting(10, "integration steps per control period (paper: 0.1 min)", within=(1, 10_000))
-    n_actions: int = setting(17, "pump rates, equally spaced on [0, max_pump_rate] (paper)", within=(2, 1001))
+    n_actions: int = setting(17, "number of pump rates, equally spaced on [0, max_pump_rate] (paper)", within=(2, 1001))
     max_pump_rate: float = setting(MAX_PUMP_RATE, "largest pump rate (paper)", "mL/s", above=0.0, at_most=0.05)
     episode_steps: int = setting(100, "control steps per episode, ended by truncation (paper)", at_least=1)
     setpoints: tuple[float, ...] = setting(
         (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
-        "one is drawn per episode (paper)",
+        "setpoints, one drawn per episode (paper)",
         "OD",
         above=0.0,
         at_most=1.5,
@@ -72,7 +72,7 @@ class EnvConfig:
     )
     start_od: tuple[float, float] = setting(
         (0.1, 1.1),
-        "uniform range of starts; not in the paper: a little wider than the setpoints on both sides",
+        "range of the initial OD, slightly wider than the setpoints (not in the paper)",
         "OD",
         above=0.0,
         at_most=4.0,
@@ -80,7 +80,7 @@ class EnvConfig:
     )
     final_reward_weight: float = setting(
         1.0,
-        "weight of the final reward of equation (4); the paper gives no form, so the last state counts as every other",
+        "weight of the final reward of equation (4); the paper gives no form, 1 counts the last state as every other",
         at_least=0.0,
     )
 

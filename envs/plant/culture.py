@@ -29,41 +29,41 @@ class GrowthConfig:
     """How cells grow; the defaults are the training model's. Every temperature law is 1 at 37 degC (envs/growth.py)."""
 
     mu: float = setting(0.03, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
-    mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
+    mu_cv: float = setting(0.0, "relative spread of mu between cultures", within=(0, 0.3))
     drift_sd_per_h: float = setting(0.0, "random walk of ln mu: sd after 1 h", "1/sqrt(h)", within=(0, 0.2))
     ramp_per_h: float = setting(0.0, "relative change of mu per hour (burden, pH, oxygen)", "1/h", within=(-0.5, 0.5))
     knots_min: tuple[float, ...] = setting(
-        (), "ages at which `knots_mu` gives mu; empty: mu is constant", "min", at_least=0.0
+        (), "culture ages at which `knots_mu` gives mu; empty: mu is constant", "min", at_least=0.0
     )
     knots_mu: tuple[float, ...] = setting(
         (),
-        "mu at those ages, straight between them, the last one from there on; in place of `mu`",
+        "mu at those ages, with linear interpolation, constant after the last; replaces `mu`",
         "1/min",
         within=(0, 0.1),
     )
-    temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
+    temperature_law: str = setting("none", "temperature dependence of mu", choices=TEMPERATURE_LAWS)
     activation_kj_mol: float = setting(
         56.0,
-        "Ea of the Arrhenius law; 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
+        "activation energy (Arrhenius); 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
         "kJ/mol",
         within=(0, 150),
     )
     adaptation_min: float = setting(
         0.0,
-        "time constant with which growth follows temperature; at once within 21 to 37 degC (Ng et al. 1962)",
+        "time constant of growth after a change of temperature; 0 within 21 to 37 degC (Ng et al. 1962)",
         "min",
         within=(0, 120),
     )
     yield_od: float = setting(
-        math.inf, "OD grown from one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
+        math.inf, "OD produced by one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
     )
     k_s: float = setting(
-        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used when yield_od is finite", within=(1e-4, 1)
+        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used if yield_od is finite", within=(1e-4, 1)
     )
-    wall_attach_per_min: float = setting(0.0, "biomass that settles on the wall", "1/min", within=(0, 1e-2))
-    wall_growth_ratio: float = setting(0.0, "growth on the wall over growth in suspension", within=(0, 1))
-    wall_detach_per_min: float = setting(0.0, "biomass that leaves the wall", "1/min", within=(0, 0.1))
-    wall_capacity_od: float = setting(1.0, "OD-equivalent at which the wall is full", "OD", within=(1e-3, 10))
+    wall_attach_per_min: float = setting(0.0, "rate of attachment of biomass to the wall", "1/min", within=(0, 1e-2))
+    wall_growth_ratio: float = setting(0.0, "growth rate on the wall relative to suspension", within=(0, 1))
+    wall_detach_per_min: float = setting(0.0, "rate of detachment from the wall", "1/min", within=(0, 0.1))
+    wall_capacity_od: float = setting(1.0, "OD-equivalent of a full wall", "OD", within=(1e-3, 10))
 
     def __post_init__(self) -> None:
         check(self, "plant.growth")

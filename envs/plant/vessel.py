@@ -24,17 +24,17 @@ class VesselConfig:
     """The vial and its bottle."""
 
     volume_ml: float | None = setting(
-        None, "mean culture up to the waste tube, where it differs from the bench's on purpose", "mL", within=(5, 50)
+        None, "mean culture volume up to the waste tube, if it should differ from the bench's", "mL", within=(5, 50)
     )
-    volume_sd_ml: float = setting(0.0, "spread of the tube's height between vials", "mL", within=(0, 1.5))
+    volume_sd_ml: float = setting(0.0, "sd of that volume between vials", "mL", within=(0, 1.5))
     overflow_above_ml: float = setting(
-        2.0, "the overflow pump's tube ends so far above the waste tube", "mL", within=(0, 10)
+        2.0, "height of the overflow pump's tube above the waste tube, as volume", "mL", within=(0, 10)
     )
     capacity_ml: float | None = setting(
-        None, "overflows above; null: a vial of 30 mL, or 10 mL above the waste tube where that is more", "mL",
+        None, "volume at which the vial overflows; null: 30 mL, or 10 mL above the waste tube if that is more", "mL",
         at_most=200.0,
     )  # fmt: skip
-    evaporation_ml_day: float = setting(0.0, "water lost", "mL/day", within=(0, 50))
+    evaporation_ml_day: float = setting(0.0, "evaporation of water", "mL/day", within=(0, 50))
     media_ml: float = setting(math.inf, "fresh medium in the bottle; inf: never empty", "mL", within=(0, math.inf))
 
     def __post_init__(self) -> None:
