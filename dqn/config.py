@@ -9,10 +9,10 @@ __all__ = ["DQNConfig"]
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """Everything that shapes learning; the defaults are a plain DQN, and conf/agent/*.yaml give values and reasons.
+    """All settings of learning; the defaults are a plain DQN, conf/agent/*.yaml have other values and reasons.
 
     Steps are control steps of one environment; updates are gradient steps.
-    Raises: ValueError naming key, value and allowed range.
+    Raises: ValueError with key, value and allowed range.
     """
 
     kind: str = setting("dqn", "algorithm")

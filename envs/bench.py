@@ -1,4 +1,4 @@
-"""What everybody has to know alike of a bench: the culture's volume, the period of its doses, the pump's cap."""
+"""Bench values that all parts of the program share: culture volume, control period, largest pump rate."""
 
 import math
 from collections.abc import Sequence
@@ -12,18 +12,18 @@ from conf.schema import check, require, setting
 __all__ = ["VIAL_ML", "Bench"]
 
 VIAL_ML = 30.0
-"""What the vial of a Chi.Bio holds up to its rim, mL (docs/biology.md, Volume)."""
+"""Volume of a Chi.Bio vial up to its rim, mL (docs/biology.md, Volume)."""
 
 WITHIN_ML = (5.0, 38.0)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Said once and read by interlock, driver, estimators, laws, certificate, timetable and simulated vials.
+    """Bench values for interlock, driver, estimators, controllers, certificate, timetable and simulated vials.
 
-    How fast a reactor is fed is asked in mL/s over a control period; what flows at once is the driver's matter.
+    A pump rate in mL/s is a mean over a control period; the driver chooses the actual flow.
 
-    Raises: ValueError naming key, value and allowed range.
+    Raises: ValueError with key, value and allowed range.
     """
 
     volume_ml: float = setting(20.0, "culture volume up to the waste tube", "mL", within=WITHIN_ML)
@@ -49,7 +49,7 @@ class Bench:
 
     @property
     def stale_s(self) -> float:
-        """Age at which a newest sample is no basis for a dose, s: the next one is late by 40 s, or a tenth more."""
+        """Age at which the newest sample is too old for a dose, s: a period and 40 s, or a tenth more."""
         return max(self.period_s + 40.0, 1.1 * self.period_s)
 
     @property

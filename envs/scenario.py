@@ -1,4 +1,4 @@
-"""What a culture is asked to do over time: phases with a setpoint and a temperature each, and maybe a composition."""
+"""Schedule of a culture: phases, each with a setpoint, a temperature and possibly a composition."""
 
 from dataclasses import dataclass, replace
 
@@ -13,18 +13,18 @@ __all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 
-ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
+ANNOUNCED_MIN = 360.0  # default announcement of a change of the composition
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Phases one after another, counted from the end of the recovery.
+    """Consecutive phases, counted from the end of the recovery.
 
-    Where `until` gives a phase a condition, its minutes are the longest it may take, and `edges`, `phase` and `at` are
-    those of a schedule in which no condition is met (`experiments/loop/progress.py` has them as they came).
-    The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
-    the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
-    `temperatures` holds. Raises: ValueError naming key, value and allowed range.
+    If `until` gives a phase a condition, its minutes are a limit, and `edges`, `phase` and `at` assume that no
+    condition is met (`experiments/loop/progress.py` has the actual times). The setpoint of the share of B may be given
+    per phase, or as mean - amplitude sin(2 pi t / period), t since the end of the recovery. With such a setpoint the
+    composition controller sets the temperature, otherwise `temperatures` applies. Raises: ValueError with key, value
+    and allowed range.
     """
 
     setpoints: tuple[float, ...] = setting((0.5,), "setpoint of each phase", "OD", above=0.0, at_most=1.5)
@@ -113,22 +113,22 @@ class Scenario:
 
     @property
     def composed(self) -> bool:
-        """Whether a share is asked for at any time."""
+        """Whether the schedule has a composition."""
         return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
 
     @property
     def announced_min(self) -> float:
-        """How long ahead a change is known, min; 0: never."""
+        """Time by which a change is announced, min; 0: never."""
         usual = ANNOUNCED_MIN if self.composed else 0.0
         return usual if self.announce_min is None else self.announce_min
 
     def resting(self, even_c: float) -> "Scenario":
-        """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""
+        """Return the schedule with a temperature in every phase; the default is that of equal growth, degC."""
         return replace(self, temperatures=tuple(even_c if t is None else t for t in self.temperatures))
 
     @property
     def supplied(self) -> frozenset[int]:
-        """The spare pumps that any phase gives by."""
+        """Spare pumps of all phases."""
         return frozenset(output.pump for text in self.outputs for output in outputs_of(text))
 
     @property
@@ -148,7 +148,7 @@ class Scenario:
         return np.where(started, np.minimum(index, len(self.setpoints) - 1), -1).astype(np.intp)
 
     def at(self, minute: Array) -> tuple[Array, Array]:
-        """Setpoint and temperature at each minute since the recovery ended, each the shape of `minute`.
+        """Return setpoint and temperature at each minute since the recovery ended, each the shape of `minute`.
 
         Before the start (minute < 0 or nan) they are those of the first phase.
         """

@@ -1,4 +1,4 @@
-"""N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
+"""N parallel training episodes as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
 
 import reprlib
 from abc import abstractmethod
@@ -24,7 +24,7 @@ EPISODES_PER_BLOCK = 64
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
-    """Actions as an array of `shape`. Raises: ValueError unless they are integers of that shape, 0 to n_actions - 1."""
+    """Return actions as an array of `shape`. Raises: ValueError unless they are integers from 0 to n_actions - 1."""
     given = np.asarray(actions)
     if given.shape != shape or given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= n_actions:
         raise ValueError(
@@ -35,7 +35,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDA
 
 
 class EpisodeSpec:
-    """`spec` of an environment with a `config`: what Gymnasium registers, with how long episodes are; no pictures.
+    """`spec` of an environment with a `config`: Gymnasium's, with the length of episodes; no rendering.
 
     Environments truncate by themselves, so no time limit is registered.
     """
@@ -45,7 +45,7 @@ class EpisodeSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium registers, with the episode's length."""
+        """Gymnasium's spec, with the episode's length."""
         return self._spec
 
     @spec.setter
@@ -53,15 +53,15 @@ class EpisodeSpec:
         self._spec = None if value is None else replace(value, max_episode_steps=self.config.episode_steps)
 
     def render(self) -> None:
-        """None and a warning, as Gymnasium's environments do without a `render_mode`: there is nothing to draw."""
+        """Return None and warn, as Gymnasium's environments do without a `render_mode`."""
         logger.warn("this environment has nothing to draw; plot what `reset` and `step` return")
 
 
 class EpisodeStreams:
-    """Uniform numbers for each episode of each copy (start, setpoint), each copy from a generator of its own.
+    """Uniform numbers for each episode of each copy (start, setpoint), from one generator per copy.
 
-    Copy i draws the same numbers whatever N is. Numbers are drawn in blocks, so that a reset of thousands of copies
-    costs no Python loop; the state is that of the generators before their block, and how far into it each copy is.
+    Copy i draws the same numbers for every N. Numbers are drawn in blocks, so a reset of thousands of copies needs no
+    Python loop. The state has the generators before their block and the position of each copy in it.
     """
 
     def __init__(self, seeds: Sequence[int | np.random.SeedSequence], numbers: int = 2) -> None:
@@ -78,7 +78,7 @@ class EpisodeStreams:
         self._position[copies] = 0
 
     def take(self, copies: NDArray[np.intp]) -> Array:
-        """Numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
+        """Return numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
         used_up = copies[self._position[copies] == EPISODES_PER_BLOCK]
         if used_up.size:
             self._refill(used_up)
@@ -99,28 +99,27 @@ class EpisodeStreams:
 
 
 class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
-    """N copies of a task whose episodes have a fixed length; a task says how they begin and how they advance.
+    """N copies of a task with episodes of fixed length; a task defines how they begin and advance.
 
-    `state` (N, O) holds every copy's observation in full precision: what changes, and the goal or parameter.
+    `state` (N, O) holds every copy's observation in full precision: the state, and the goal or parameter.
     End: never terminated; truncated after `config.episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
-    the step after it starts the next episode, whatever the action, with reward 0 (Gymnasium's stateful wrappers).
+    the next step ignores its action and starts the next episode, with reward 0 (Gymnasium's stateful wrappers).
 
     Args:
       num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
-      render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
+      render_mode: None; there is no drawing. max_episode_steps: Gymnasium's name; ends episodes that are longer.
       continuous: actions are numbers from 0 to 1, shape (N, 1), in the place of indices: anywhere on the grid's range.
-    Raises: ValueError naming what is not allowed, or a value that the task does not have and those it has; TypeError
-      for a `render_mode`.
+    Raises: ValueError with the invalid value, or an unknown key and the known ones; TypeError for a `render_mode`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
     default: type[C]
     names: tuple[str, ...]
-    """Of the numbers of an observation, in their order; a reset's options may give them."""
+    """Names of the observation's numbers, in order; options of a reset may set them."""
     numbers = 2
-    """Uniform numbers that an episode begins from."""
+    """Number of uniform numbers for the start of an episode."""
 
     config: C
 
@@ -141,7 +140,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
             config = self.default(**overrides)
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)
-        if render_mode is not None:  # a TypeError: Stable-Baselines3 asks for a picture, and goes on without
+        if render_mode is not None:  # a TypeError: Stable-Baselines3 requests rendering, and continues without
             raise TypeError(f"render_mode = {render_mode}: allowed None (there is nothing to draw)")
         modes = {AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP}
         allowed = ", ".join(sorted(str(mode) for mode in modes))
@@ -167,18 +166,18 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Space of one copy's observations."""
 
     def _prepare(self) -> None:
-        """Compute what a task needs once."""
+        """Prepare the task once."""
 
     @abstractmethod
     def _begun(self, numbers: Array) -> Array:
-        """State (K, O) of new episodes from uniform numbers, (K, numbers)."""
+        """Return the state (K, O) of new episodes from uniform numbers, (K, numbers)."""
 
     @abstractmethod
     def _advance(self, actions: NDArray[Any]) -> Array:
-        """Change `state` by one control period; the rewards (N,). Args: actions: indices, or numbers from 0 to 1."""
+        """Advance `state` by one period; return the rewards (N,). Args: actions: indices, or numbers from 0 to 1."""
 
     def _weigh(self, last: Array) -> Array:
-        """Rewards of the last steps of episodes, (K,)."""
+        """Return the rewards of the last steps of episodes, (K,)."""
         return last
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
@@ -201,11 +200,11 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Start new episodes.
 
         Args:
-          seed: an integer (copy i gets seed + i), one integer or None per copy, or None to go on with the streams.
-          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` is how
-            they start, instead of as drawn, {"od": 0.3, "setpoint": 0.5}.
+          seed: an integer (copy i gets seed + i), one integer or None per copy, or None to continue the streams.
+          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` sets the
+          start instead of a random draw, {"od": 0.3, "setpoint": 0.5}.
         Returns: observations (N, O), {}.
-        Raises: ValueError if the mask has another shape, or naming an option that there is not or a value out of range.
+        Raises: ValueError for a mask of another shape, an unknown option or a value out of range.
         """
         if isinstance(seed, int):
             seed = [seed + i for i in range(self.num_envs)]
@@ -224,13 +223,13 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return self._observe(), {}
 
     def _column(self, name: str) -> int:
-        """Which number of an observation. Raises: ValueError."""
+        """Return the column of a named number of the observation. Raises: ValueError."""
         names = self.names[: self.state.shape[1]]
         require(name in names, "reset option", name, ", ".join(("reset_mask", *names)))
         return names.index(name)
 
     def _checked(self, name: str, value: Any) -> Array:
-        """Check a start that a reset was given, (N,). Raises: ValueError."""
+        """Check a start given to a reset, (N,). Raises: ValueError."""
         space, column = self.observations(self.config), self._column(name)
         low, high = float(space.low[column]), float(space.high[column])
         given = np.asarray(value, dtype=np.float64)
@@ -241,12 +240,11 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     def step(
         self, actions: NDArray[np.intp]
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One control period in every copy.
+        """Advance every copy by one control period.
 
         Args: actions: indices of the action grid, shape (N,), integers; `continuous`: numbers from 0 to 1, (N, 1).
         Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
-          where an episode ended, infos["final_obs"] (N, O) holds its last observation and infos["_final_obs"] (N,)
-          says where.
+        infos["final_obs"] (N, O) has the last observations of ended episodes and infos["_final_obs"] (N,) their mask.
         Raises: RuntimeError before the first reset; ValueError for actions of another shape or outside the grid.
         """
         if self._streams is None:
@@ -270,7 +268,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return given[..., 0]
 
     def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
-        """Weigh the last reward of ended episodes, in place, and begin the next ones or let them wait; the infos."""
+        """Weight the last reward of ended episodes in place, begin the next ones or let them wait; return infos."""
         reward[truncated] = self._weigh(reward[truncated])
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._waiting = truncated.copy()
@@ -300,7 +298,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
 
 class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
-    """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
+    """A culture at a setpoint, with a choice of the pump rate every control period (paper, sections 2 and 3).
 
     Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
 
@@ -320,7 +318,7 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:
-        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is capped where no sensor reads further."""
+        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is limited to the range of a sensor."""
         return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
 
     def _prepare(self) -> None:

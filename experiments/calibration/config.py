@@ -14,7 +14,7 @@ LAWS = ("open_loop", "pi", "pi_tuned", "threshold", "proportional")
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """A recording and how it is fitted; or the generator of recordings; or the study of the intervals' coverage."""
+    """Config of a calibration, of the generator of recordings, or of the study of the intervals' coverage."""
 
     data: str | None = setting(None, "recording (CSV); null: the simulated recording of the project")
     rows: str | None = setting(None, "FIRST:END, data rows from 0, without END; null: all")

@@ -1,4 +1,4 @@
-"""What a certificate is asked to prove."""
+"""Config of a certificate: what to prove."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -10,15 +10,15 @@ from envs.task import EnvConfig
 __all__ = ["CertifyConfig", "Limits"]
 
 
-ASKED = ("uncertainty", "noise", "error", "error_od", "error_share", "error_gain")  # the larger, the more is asked
+ASKED = ("uncertainty", "noise", "error", "error_od", "error_share", "error_gain")  # larger values are stricter
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest values that a certificate allows; docs/certificate.md has the figures of policies that are good and bad.
+    """Largest values that a certificate allows; docs/certificate.md has values of good and bad policies.
 
     Limits whose names begin with `safe_` are limits of safety: a device refuses a policy that exceeds one. All others
-    are limits of performance: a device tells them and runs the policy.
+    are limits of performance: a device reports them and runs the policy.
 
     Raises: ValueError naming key, value and allowed range.
     """
@@ -138,7 +138,7 @@ class CertifyConfig:
     limits: Limits = part(Limits, "limits of the requirements")
 
     def laxer(self) -> list[str]:
-        """Return every value by which less of safety is asked than by default."""
+        """Return every value that makes safety less strict than the default."""
         usual = CertifyConfig()
         named = [(n, own, by) for n in ASKED if (own := getattr(self, n)) < (by := getattr(usual, n))]
         named += [("strip", self.strip, usual.strip)] if self.strip > usual.strip else []
@@ -148,11 +148,11 @@ class CertifyConfig:
         return [f"{name} = {own}, by itself {by}" for name, own, by in named] + self._limits(safety=True)
 
     def laxer_performance(self) -> list[str]:
-        """Return every limit of performance by which less is asked than by default."""
+        """Return every performance limit that is less strict than the default."""
         return self._limits(safety=False)
 
     def _limits(self, safety: bool) -> list[str]:
-        """Return the limits of one kind that are laxer than by default. `reached` are the only least values."""
+        """Return the limits of one kind that are less strict than the default. Only `reached` are lower limits."""
         found = []
         for name in (f.name for f in fields(Limits) if f.name.startswith("safe_") is safety):
             own, by = getattr(self.limits, name), getattr(Limits(), name)

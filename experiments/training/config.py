@@ -33,7 +33,7 @@ def agent_schema(kind: str, key: str = "agent") -> Any:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
+    """`python -m experiments.train`. Raises: ValueError with key, value and allowed range."""
 
     env: Any = part(EnvConfig, "the training model and its episodes", env_schema)
     agent: Any = part(DQNConfig, "the agent's hyper-parameters", agent_schema)
