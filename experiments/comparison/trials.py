@@ -28,15 +28,15 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli.calibrated import read_pair
 from experiments.cli.stop import Workers
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import TRUE, Share, program_of
 from experiments.comparison.config import BenchmarkConfig
 from experiments.control.policies import load_policy
 from experiments.laws import registry
 from experiments.laws.base import Controller
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.recall import Recall
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import WindowMetrics, window_metrics
-from experiments.loop.share import TRUE, Share, program_of
 from experiments.loop.signals import Signal, within_2sd
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock

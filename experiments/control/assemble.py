@@ -28,17 +28,17 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
 from experiments.cli.files import choices
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.program import Program
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import LightSignal, Share, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.policies import WantedPolicy, admit, composition_policy, policy_check, run_policy
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.program import Program
-from experiments.laws.share.recall import Recall
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.progress import Progress
-from experiments.loop.share import LightSignal, Share, program_of
 from experiments.loop.signals import AIM, Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop, is_over

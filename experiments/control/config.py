@@ -7,9 +7,9 @@ from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
+from experiments.coculture.signal import ShareWarnings
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
-from experiments.loop.share import ShareWarnings
 from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig

@@ -11,6 +11,23 @@ from envs.coculture.pair import PairConfig
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
+from experiments.coculture.laws import (
+    PI,
+    BangBang,
+    BangBangConfig,
+    InverseDynamics,
+    InverseDynamicsConfig,
+    Midpoint,
+    MidpointConfig,
+    Myopic,
+    MyopicConfig,
+    PIConfig,
+    Proportional,
+    ProportionalConfig,
+)  # fmt: skip
+from experiments.coculture.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
+from experiments.coculture.planned import Optimum, OptimumConfig, Receding, RecedingConfig
+from experiments.coculture.program import Program
 from experiments.laws.base import Array
 from experiments.laws.density.baselines import (
     GainScheduled,
@@ -25,23 +42,6 @@ from experiments.laws.density.learned import LearnedConfig, learned
 from experiments.laws.density.mpc import Mpc, MpcConfig
 from experiments.laws.density.oracle import Oracle, OracleConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
-from experiments.laws.share.laws import (
-    PI,
-    BangBang,
-    BangBangConfig,
-    InverseDynamics,
-    InverseDynamicsConfig,
-    Midpoint,
-    MidpointConfig,
-    Myopic,
-    MyopicConfig,
-    PIConfig,
-    Proportional,
-    ProportionalConfig,
-)  # fmt: skip
-from experiments.laws.share.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
-from experiments.laws.share.planned import Optimum, OptimumConfig, Receding, RecedingConfig
-from experiments.laws.share.program import Program
 
 __all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "LawKind", "add", "build", "config", "on_device", "takes"]
 
@@ -103,7 +103,7 @@ def add(
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`; one of the share also has the
-        field `estimator` of `experiments.laws.share.laws.LawConfig`.
+        field `estimator` of `experiments.coculture.laws.LawConfig`.
       make: called with the config and then the `parts`, returns the law.
       what: the sentence that the help shows.
       parts: what else it is made from, arguments of `build`.

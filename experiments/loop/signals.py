@@ -1,7 +1,7 @@
 """What the loop holds: signals. Each has an estimate, a law that decides, an actuator, columns and warnings of its own.
 
 The density, held by the feed pump, is always one of them (`Density`). The share of two species, held by the thermostat,
-is another (`experiments/loop/share.py`). One of one's own is made known by `add` (docs/extending.md).
+is another (`experiments/coculture/signal.py`). One of one's own is made known by `add` (docs/extending.md).
 """
 
 import math

@@ -10,15 +10,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
+from experiments.coculture.charts import composition_figure
+from experiments.coculture.signal import program_of
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
-from experiments.loop.share import program_of
 from experiments.loop.signals import AIM, FILTER_ALARM
 from experiments.record.record import Recordings
 from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
-from experiments.reporting.composition_charts import composition_figure
 from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 

@@ -15,7 +15,7 @@ from dqn.trainer import TrainingEnv
 from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
-from experiments.training.coculture import Coculture
+from experiments.coculture.task import Coculture
 from experiments.training.config import ENVS
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluated

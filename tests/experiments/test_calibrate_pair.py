@@ -16,7 +16,8 @@ from envs.plant.plant import Plant, of_pair
 from experiments import calibrate_pair as command
 from experiments.calibrate_pair import CalibratePairConfig, _growth, _pigment, _plateaus, _say, calibrate_pair
 from experiments.cli import frame
-from experiments.reporting import charts, composition_charts
+from experiments.coculture import charts as composition_charts
+from experiments.reporting import charts
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
 

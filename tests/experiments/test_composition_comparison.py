@@ -13,12 +13,12 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import benchmark
 from experiments.cli import frame
+from experiments.coculture.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.comparison import statistics, studies
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.run import policies_of, with_pair
 from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
 from experiments.control.policies import SHIPPED_COMPOSITION
-from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.loop.loop import ClosedLoop
 from tests.experiments.test_benchmark import load
 from tests.experiments.test_deploy import inverse_policy

@@ -14,10 +14,10 @@ import yaml
 from experiments import report
 from experiments.cli import frame
 from experiments.cli.calibrated import read_pair
+from experiments.coculture.signal import COLUMNS
 from experiments.control import assemble, policies, run
 from experiments.deploy import main
 from experiments.loop.metrics import mean_errors
-from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.storage.recording_reader import read_recording
 

@@ -17,10 +17,10 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
+from experiments.coculture.signal import Share
 from experiments.control import assemble
 from experiments.control.run import BenchMarks
 from experiments.laws import registry
-from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig

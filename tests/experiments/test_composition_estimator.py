@@ -7,9 +7,7 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.trials import Cell, run_cell
-from experiments.laws.share.estimator import (
+from experiments.coculture.estimator import (
     BIAS_E,
     BIAS_P,
     FACTOR,
@@ -23,6 +21,8 @@ from experiments.laws.share.estimator import (
     CompositionEstimator,
     CompositionEstimatorConfig,
 )
+from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.trials import Cell, run_cell
 from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 
 pytestmark = pytest.mark.numeric

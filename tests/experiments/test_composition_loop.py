@@ -11,11 +11,11 @@ import pytest
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.coculture.base import Array, Mask, ShareEstimate, Wanted
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.signal import COLUMNS, Share, ShareWarnings
 from experiments.laws import registry
-from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
-from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
-from experiments.loop.share import COLUMNS, Share, ShareWarnings
 from experiments.loop.signals import Sample, Signal
 from experiments.record.record import Recordings
 from experiments.record.summary import composition_figure_of, figure_of

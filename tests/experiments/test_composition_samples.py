@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.laws import registry
-from experiments.laws.share import recall
-from experiments.laws.share.estimator import (
+from experiments.coculture import recall
+from experiments.coculture.estimator import (
     FACTOR,
     GAIN,
     LOGIT,
@@ -17,8 +16,9 @@ from experiments.laws.share.estimator import (
     CompositionEstimator,
     CompositionEstimatorConfig,
 )
-from experiments.laws.share.recall import Recall
-from experiments.loop.share import Share
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import Share
+from experiments.laws import registry
 from hardware import memory
 
 CONFIG = CompositionEstimatorConfig(starts=1)

@@ -31,13 +31,14 @@ from envs.task import EnvConfig
 from experiments.certification.config import CertifyConfig
 from experiments.certification.figure import figure as certificate_figure
 from experiments.certification.judge import Certificate, certify
+from experiments.coculture import charts as composition_charts
+from experiments.coculture.charts import pair_figure
 from experiments.comparison import figures
 from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
 from experiments.record.record import Recordings
 from experiments.record.summary import composition_figure_of, figure_of
-from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
+from experiments.reporting import calibration_charts, charts, sweep_charts
 from experiments.reporting.calibration_charts import agreement_figure
-from experiments.reporting.composition_charts import pair_figure
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 

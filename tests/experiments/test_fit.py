@@ -17,12 +17,12 @@ from envs.plant.pump import PumpConfig
 from envs.plant.vessel import VesselConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
+from experiments.coculture.signal import Share, ShareWarnings
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.deploy import main
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
-from experiments.loop.share import Share, ShareWarnings
 from experiments.record.record import Record
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig

@@ -183,7 +183,7 @@ def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatc
 
     The optimum is found on a coarse grid of shares.
     """
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=41))
     drawn, save = {}, train_run.charts.save
 
     def kept(figure, folder, name):

@@ -25,11 +25,11 @@ from envs.coculture.task import CocultureConfig, logit, share
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
+from experiments.coculture.task import Coculture
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.train import main as entry_point
 from experiments.training import announcements, build, tasks
 from experiments.training import run as train_run
-from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluation, Rollout, Score, each
@@ -409,11 +409,11 @@ def test_a_relative_policy_sees_the_edge_of_its_training_beyond_it() -> None:
 
 def test_the_share_that_is_drawn_as_asked_for_is_that_of_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Decision by decision, also at that in which the change comes."""
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=41))
     drawn: list[Any] = []
-    monkeypatch.setattr("experiments.reporting.composition_charts.episodes", lambda *given: drawn.append(given))
+    monkeypatch.setattr("experiments.coculture.charts.episodes", lambda *given: drawn.append(given))
     task = Coculture(CocultureConfig(preview_min=120.0, episode_steps=12, control_min=30.0))
-    monkeypatch.setattr("experiments.training.coculture.each", lambda _: lambda o: np.zeros(o.shape[:-1], dtype=int))
+    monkeypatch.setattr("experiments.coculture.task.each", lambda _: lambda o: np.zeros(o.shape[:-1], dtype=int))
     best = task.best
     monkeypatch.setattr(task, "best", lambda start: drawn.append(best(start)) or drawn[-1])
     task.figures(inverse_policy())
@@ -555,7 +555,7 @@ def test_grids_of_a_share_are_every_start_with_every_setpoint_at_rest() -> None:
 
 def test_the_optimum_of_many_programs_at_once_is_that_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty changes, which are more than are taken together, on a coarse grid of shares."""
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=21))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=21))
     task = Coculture(CocultureConfig(n_actions=5, control_min=30.0, preview_min=60.0, episode_steps=3))
     start = task.report_grid()[:30][::-1]
     together = task.best(start)

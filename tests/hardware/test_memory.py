@@ -20,12 +20,12 @@ from dqn import policy as policies
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import files
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import Share
 from experiments.control.policies import SHIPPED_COMPOSITION, load_policy
 from experiments.laws import registry
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.recall import Recall
 from experiments.loop.loop import ClosedLoop
-from experiments.loop.share import Share
 from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 

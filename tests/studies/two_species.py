@@ -16,12 +16,12 @@ from conf.schema import check, setting
 from dqn.policy import load
 from experiments.cli import files
 from experiments.cli.stop import Workers
+from experiments.coculture.base import Array
+from experiments.coculture.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.coculture.recall import Recall
 from experiments.control.assemble import COMPOSITION
 from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.laws import registry
-from experiments.laws.share.base import Array
-from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
-from experiments.laws.share.recall import Recall
 from tests.entry import command
 from tests.studies import second_vials
 from tests.studies.results import leave

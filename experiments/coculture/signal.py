@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from conf.schema import check, setting
 from envs.coculture.task import logit
 from envs.scenario import Scenario
-from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
-from experiments.laws.share.program import Program
+from experiments.coculture.base import Array, Law, Mask, ShareEstimator, Wanted
+from experiments.coculture.program import Program
 from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers

@@ -28,7 +28,7 @@ from envs.coculture.task import (
     passed,
     share,
 )
-from experiments.reporting import composition_charts
+from experiments.coculture import charts
 from experiments.training.evaluation import Rollout, each, rollout
 
 __all__ = ["Coculture"]
@@ -158,7 +158,7 @@ class Coculture:
         last = share(picked[:, NEXT if self.config.preview_min else SETPOINT])
         wanted = np.where(hours[:, None] <= change, share(picked[:, SETPOINT]), last)
         temperatures = (self.actions[ours.action[:, 0]], self.actions[theirs.action[:, 0]])
-        figure = composition_charts.episodes(
+        figure = charts.episodes(
             hours,
             wanted,
             share(ours.state[:, 0]),

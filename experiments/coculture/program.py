@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import require
-from experiments.laws.share.base import Array, Wanted
+from experiments.coculture.base import Array, Wanted
 
 __all__ = ["SINE_LEAD_MIN", "Program"]
 

@@ -8,8 +8,8 @@ from conf.schema import build, require, setting
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
-from experiments.laws.share.base import Array, ShareEstimate, Wanted
-from experiments.laws.share.laws import Index, LawConfig, Periodic
+from experiments.coculture.base import Array, ShareEstimate, Wanted
+from experiments.coculture.laws import Index, LawConfig, Periodic
 
 __all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
 
