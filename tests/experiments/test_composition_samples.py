@@ -8,6 +8,7 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.coculture import recall
+from experiments.coculture.base import SHARE
 from experiments.coculture.estimator import (
     FACTOR,
     GAIN,
@@ -172,7 +173,7 @@ def test_a_resumed_run_that_is_told_its_past_is_one_that_was_not_interrupted(hou
                 cells = (minute, *(float(a[n]) for a in arguments[:3]), 1.0, NAN)
                 for key, value in zip(keys, cells, strict=True):
                     rows[n][key].append(value)
-    law = registry.build(registry.config("proportional", registry.SHARE), registry.SHARE)
+    law = registry.build(registry.config("proportional", SHARE), SHARE)
     scenario = Scenario((0.5,), (100.0,), (33.2,), ratios=(0.4,))
     share = Share(Recall(CompositionEstimator(CONFIG)), law, [scenario, scenario])
     share.estimator = again
