@@ -7,7 +7,7 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 | observation | what it is | actions |
 |---|---|---|
 | od, setpoint | OD x and setpoint r | pump rates, mL/s |
-| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | shares of full pump |
+| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | parts of it |
 
 `add` makes other observations known.
 """

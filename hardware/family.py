@@ -206,8 +206,11 @@ class Family:
         heat = (THERMOSTAT,) if self.no_thermostat(backend) is None else ()
         return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
-    def coculture(self, backend: Any, pair: str) -> Any:
-        """Put vials of two species into a config that simulates vials that were left as they are. pair: which."""
+    def holding(self, backend: Any, preset: str, **values: Any) -> Any:
+        """Put a preset of vials into a config that simulates vials of its own, where none was chosen.
+
+        Args: values: further ones of the config.
+        """
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:

@@ -110,13 +110,7 @@ GUEST_ROOMS = ("envs.coculture", "experiments.coculture", "experiments.calibrate
 GUEST_WORDS = re.compile(r"coculture|species|composition|pairconfig|of_pair", re.IGNORECASE)
 NAMED_ALL_THE_SAME = {
     "conf.guests": "the one place where guests are registered",
-    "envs.plant": "the simulated vial may hold two species",
-    "envs.identification.curves": "of a species that grows alone",
-    "hardware.emulator": "vials of two species are a preset of the device in software",
-    "hardware.chibio.config": "the same",
-    "hardware.family": "the same",
-    "hardware.safety": "the thermostat's limits are safety.composition_low and composition_high",
-    "experiments.loop.signals": "the same",
+    "hardware.safety.config": "the thermostat's limits are the keys composition_low and composition_high",
     "hardware.storage.marks": "a share that was counted is a column of marks.csv",
     "experiments.mark": "and a key of the command",
 }

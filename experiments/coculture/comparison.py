@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from envs.bench import Bench
-from envs.plant.plant import Plant, of_pair
+from envs.coculture.second import of_pair, of_plant
+from envs.plant.plant import Plant
 from experiments.cli import frame
 from experiments.coculture.base import SHARE, Array
 from experiments.coculture.config import of_benchmark, of_study, read_pair
@@ -155,7 +156,7 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
     """Vials of the two species, and a temperature in every phase: by default that at which they grow alike."""
     pair = read_pair(of_benchmark(config).pair)
     scenarios = {name: resting(s, pair.resting_c) for name, s in config.scenarios.items()}
-    plants = {name: of_pair(p, pair) if p.second.present else p for name, p in config.plants.items()}
+    plants = {name: of_pair(p, pair) if of_plant(p).second.present else p for name, p in config.plants.items()}
     return replace(config, scenarios=scenarios, plants=plants)
 
 

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from conf.schema import part, require, setting
 from envs.coculture.pair import FILE, PairConfig, named_pair
+from envs.coculture.second import of_plant
 from envs.coculture.task import SCALES, CocultureConfig
 from experiments.cli import files, frame
 from experiments.coculture.base import SHARE
@@ -23,7 +24,7 @@ from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 
 __all__ = [
-    "OfBenchmark", "OfDeploy", "OfStudy", "OfTrain", "completed", "of_benchmark", "of_deploy", "of_study",
+    "OfBenchmark", "OfDeploy", "OfEmulator", "OfStudy", "OfTrain", "completed", "of_benchmark", "of_deploy", "of_study",
     "read_curves", "read_pair",
 ]  # fmt: skip
 
@@ -49,6 +50,12 @@ class OfDeploy:
     pair: str = setting(
         USUAL, "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
     )
+
+
+class OfEmulator:
+    """What the device in software can be told of two species."""
+
+    pair: str = setting(USUAL, "two species: a preset of conf/strains, or a pair.yaml")
 
 
 class OfTrain:
@@ -95,7 +102,7 @@ class OfBenchmark:
         same = len(of_two) in (0, len(config.studies))
         require(same, "studies", ", ".join(config.studies), "all with compositions, or none: their numbers differ")
         asks = [key for key, s in config.scenarios.items() if composed(s)]
-        plants = [key for key, p in config.plants.items() if p.second.present]
+        plants = [key for key, p in config.plants.items() if of_plant(p).second.present]
         for name, study in of_two.items():
             unknown = [law for law in of_study(study).compositions if law not in self.compositions]
             if unknown:

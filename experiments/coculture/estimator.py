@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.bench import Bench
+from envs.coculture.fluorescence import DAY_MIN
 from envs.coculture.pair import PairConfig
-from envs.plant.fluorescence import DAY_MIN
 from experiments.coculture.base import Array, Mask, ShareEstimate
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]

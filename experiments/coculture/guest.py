@@ -8,7 +8,7 @@ from envs import scenario
 from envs.coculture.task import CocultureConfig
 from envs.scenario import Scenario
 from experiments.coculture.base import SEEN, SEEN_AHEAD, SHARE
-from experiments.coculture.config import OfBenchmark, OfDeploy, OfStudy, OfTrain, completed
+from experiments.coculture.config import OfBenchmark, OfDeploy, OfEmulator, OfStudy, OfTrain, completed
 from experiments.coculture.laws import (
     PI,
     BangBang,
@@ -37,6 +37,7 @@ from experiments.reporting import curves
 from experiments.reporting.curves import Chart, Curve, line
 from experiments.training import config as training
 from experiments.training.config import TrainConfig
+from hardware.family import family
 
 
 def _task(config: CocultureConfig) -> Any:
@@ -68,6 +69,7 @@ scenario.HEATED.append(composed)
 for to, more in (
     (Scenario, Ratios),
     (DeployConfig, OfDeploy),
+    (family("emulator").config, OfEmulator),
     (TrainConfig, OfTrain),
     (StudyConfig, OfStudy),
     (BenchmarkConfig, OfBenchmark),

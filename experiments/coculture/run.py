@@ -11,7 +11,8 @@ from conf import presets
 from conf.presets import load
 from conf.schema import build
 from envs.coculture.pair import FILE, PairConfig
-from envs.plant.plant import PlantConfig, of_pair
+from envs.coculture.second import of_pair, of_plant
+from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import files, frame
 from experiments.coculture.base import SHARE
@@ -48,7 +49,8 @@ class TwoSpecies(Guest):
         pair = read_pair(of_deploy(config).pair)
         if any(map(composed, config.schedules())):
             config = _composed(config, pair)
-        if family_of(config.backend).simulated and config.plant.pair == PairConfig():  # another differs on purpose
+        usual = of_plant(config.plant).pair == PairConfig()  # another one differs on purpose
+        if family_of(config.backend).simulated and usual:
             config = replace(config, plant=of_pair(config.plant, pair))
         return config
 
@@ -63,7 +65,7 @@ class TwoSpecies(Guest):
         if of_deploy(config).composition is not None:
             return [_share(config, plant, folder, scenarios)]
         vials = family.vials(backend, plant)
-        lit = family.sees_fluorescence(backend) or (vials is not None and vials[1].second.present)
+        lit = family.sees_fluorescence(backend) or (vials is not None and of_plant(vials[1]).second.present)
         return [LightSignal()] if lit and not config.signals else []
 
     def vials(self, config: DeployConfig) -> str:
@@ -102,7 +104,7 @@ def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
         law = build(registry.config(COMPOSITION, SHARE), load(f"composition/{COMPOSITION}"), "composition")
         config = _changed(config, composition=law)
         chosen.append(f"composition={COMPOSITION}")
-    if (two := family_of(backend).coculture(backend, of_deploy(config).pair)) != backend:
+    if (two := family_of(backend).holding(backend, VIALS, pair=of_deploy(config).pair)) != backend:
         config = replace(config, backend=two)
         chosen.append(f"backend.plant={two.plant} backend.pair={two.pair}")
     usual = build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
@@ -156,7 +158,7 @@ def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: li
         remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
         raise frame.UserError(f"composition={kind}: no scenario asks for a share; {remedy}")
     vials = family.vials(config.backend, plant)
-    if vials is not None and not vials[1].second.present:
+    if vials is not None and not of_plant(vials[1]).second.present:
         key = f"{vials[0]}={VIALS}"
         raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
     one = next(s for s in scenarios if composed(s))

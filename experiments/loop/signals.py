@@ -83,7 +83,7 @@ class Sample:
         """Build a sample: a measurement with what the interlock says of its light and of targets."""
         light, safety = interlock.fluorescence(m), interlock.config
         light = np.full(m.od.shape, np.nan) if light is None else light
-        limits = safety.composition_low, safety.composition_high
+        limits = safety.targets
         schedule = elapsed, phase, setpoint, temperature, limits, *(ahead or ())
         return cls(m, light, rows, believed, m.time_s / 60.0, *schedule)
 
