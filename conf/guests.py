@@ -7,6 +7,7 @@ __all__ = ["GUESTS", "load"]
 GUESTS = {
     "envs": ("envs.coculture.guest",),
     "experiments": ("experiments.coculture.guest",),
+    "experiments.record": ("experiments.coculture.aftermath",),
     "experiments.comparison": ("experiments.coculture.comparison",),
 }
 """Room that is added to -> the modules that add what its guests bring (docs/extending.md)."""

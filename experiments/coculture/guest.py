@@ -7,24 +7,9 @@ from dqn import policy
 from envs import scenario
 from envs.coculture.task import CocultureConfig
 from envs.scenario import Scenario
+from experiments.coculture import laws, learned, planned
 from experiments.coculture.base import SEEN, SEEN_AHEAD, SHARE
 from experiments.coculture.config import OfBenchmark, OfDeploy, OfEmulator, OfStudy, OfTrain, completed
-from experiments.coculture.laws import (
-    PI,
-    BangBang,
-    BangBangConfig,
-    InverseDynamics,
-    InverseDynamicsConfig,
-    Midpoint,
-    MidpointConfig,
-    Myopic,
-    MyopicConfig,
-    PIConfig,
-    Proportional,
-    ProportionalConfig,
-)
-from experiments.coculture.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
-from experiments.coculture.planned import Optimum, OptimumConfig, Receding, RecedingConfig
 from experiments.coculture.program import Ratios, composed
 from experiments.coculture.run import TwoSpecies
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
@@ -32,7 +17,6 @@ from experiments.control import guests
 from experiments.control.config import DeployConfig
 from experiments.laws import registry
 from experiments.laws.registry import Part
-from experiments.record.aftermath import INCOMPARABLE
 from experiments.reporting import curves
 from experiments.reporting.curves import Chart, Curve, line
 from experiments.training import config as training
@@ -50,16 +34,16 @@ needs = "needs a policy; give policy=RUN/policy.npz of a training with env=cocul
 plans = "plans the whole program; give a scenario with ratios"
 registry.hold(SHARE, "composition", {"policy": Part(missing=needs), "program": Part(missing=plans), "pair": Part()})
 for kind, config, law, parts in (
-    ("dqn", LearnedLawConfig, LearnedLaw, ("policy", "pair")),
-    ("dqn_preview", PreviewLawConfig, LearnedLaw, ("policy", "pair")),
-    ("pi", PIConfig, PI, ("pair",)),
-    ("proportional", ProportionalConfig, Proportional, ("pair",)),
-    ("inverse_dynamics", InverseDynamicsConfig, InverseDynamics, ("pair",)),
-    ("bang_bang", BangBangConfig, BangBang, ("pair",)),
-    ("myopic", MyopicConfig, Myopic, ("pair",)),
-    ("midpoint", MidpointConfig, Midpoint, ("pair",)),
-    ("receding", RecedingConfig, Receding, ("pair",)),
-    ("optimum", OptimumConfig, Optimum, ("program", "pair")),
+    ("dqn", learned.LearnedLawConfig, learned.LearnedLaw, ("policy", "pair")),
+    ("dqn_preview", learned.PreviewLawConfig, learned.LearnedLaw, ("policy", "pair")),
+    ("pi", laws.PIConfig, laws.PI, ("pair",)),
+    ("proportional", laws.ProportionalConfig, laws.Proportional, ("pair",)),
+    ("inverse_dynamics", laws.InverseDynamicsConfig, laws.InverseDynamics, ("pair",)),
+    ("bang_bang", laws.BangBangConfig, laws.BangBang, ("pair",)),
+    ("myopic", laws.MyopicConfig, laws.Myopic, ("pair",)),
+    ("midpoint", laws.MidpointConfig, laws.Midpoint, ("pair",)),
+    ("receding", planned.RecedingConfig, planned.Receding, ("pair",)),
+    ("optimum", planned.OptimumConfig, planned.Optimum, ("program", "pair")),
 ):
     registry.add(kind, config, law, "", parts, SHARE)
 for observation in (SEEN, SEEN_AHEAD):
@@ -118,11 +102,4 @@ curves.add(
     },
     metrics={"result/share_abs_error": "error of the share"},
     pictures={"figures/composition": "share, temperature, OD and fluorescence of a deployment"},
-)
-INCOMPARABLE.append(
-    lambda config: (
-        "the growth of two species follows their share, and the model is of one species"
-        if config.get("composition")
-        else ""
-    )
 )

@@ -18,7 +18,6 @@ from experiments.cli import files, frame
 from experiments.coculture.base import SHARE
 from experiments.coculture.config import of_deploy, read_pair
 from experiments.coculture.estimator import CompositionEstimator
-from experiments.coculture.policies import check_shares, composition_policy
 from experiments.coculture.program import composed, program_of, ratios_of, resting
 from experiments.coculture.recall import Recall
 from experiments.coculture.signal import LightSignal, Share
@@ -151,6 +150,8 @@ def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
     """Build the signal of the share. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
+    from experiments.coculture.policies import check_shares, composition_policy  # and certificates with them
+
     asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if composed(s)]
     family, two = family_of(config.backend), of_deploy(config)
     kind = two.composition.kind

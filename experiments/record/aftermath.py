@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from conf import guests
 from conf.schema import build
 from dqn import policy as policies
 from envs.bench import Bench
@@ -124,6 +125,7 @@ def write(page: Page, run: Path, label: str = "") -> None:
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     reactors = summary.get("reactors") if isinstance(summary, Mapping) else None
     page.section(f"{label}: predicted and measured" if label else "Predicted and measured")
+    guests.load("experiments.record")
     for why in filter(None, (reason(_config(run)) for reason in INCOMPARABLE)):
         page.text(f"Not compared: {why}.")
         return

@@ -76,12 +76,8 @@ def test_a_phase_has_its_own_temperature_and_the_even_one_only_where_it_gives_no
 
 def test_a_list_that_is_too_short_is_told_by_its_length():
     """`scenario.setpoints=[5]` alone, beside three minutes and temperatures of a preset."""
-    with pytest.raises(ValueError, match=r".") as caught:
+    with pytest.raises(ValueError, match="^scenario.setpoints, minutes, temperatures = lists of 1, 3 and 3: allowed "):
         Scenario((5.0,), (30.0,) * 3, (37.0,) * 3)
-    assert str(caught.value) == (
-        "scenario.setpoints, minutes, temperatures = lists of 1, 3 and 3: "
-        "allowed one or more setpoints, and an entry of minutes and of temperatures for each of them"
-    )
     with pytest.raises(ValueError, match="lists of 0, 0 and 0"):
         Scenario((), (), ())
 
