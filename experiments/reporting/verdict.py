@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.reporting.curves import BAND, ERROR_UNITS
+from experiments.reporting.curves import BAND, CALLED, ERROR_UNITS, signals_in
 from experiments.reporting.tables import count, number
 
 __all__ = ["REMEDY", "Headline", "verdict"]
@@ -89,9 +89,11 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
     steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
     items = [f"fresh medium {number(summary['volume_ml'])} mL"]
     items += [f"interlock spoke in {count(sum(r['interlock'] for r in summary['reactors'].values()), 'sample')}"]
-    shares = [w["ratio_abs_error_mean"] for w in windows if w.get("ratio_abs_error_mean") is not None]
-    if shares:
-        items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")
+    for signal in signals_in(windows):
+        errors = [w[key] for w in windows if w.get(key := f"{signal}_abs_error_mean") is not None]
+        if errors:
+            said = number(float(np.mean(errors)))
+            items.append(f"mean error of the {CALLED.get(signal, signal)} {said}, as estimated")
     if not steady:
         return Headline(claim, items, "No window was long enough to say how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
