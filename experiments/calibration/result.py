@@ -14,7 +14,7 @@ from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
 from envs.task import EnvConfig
 from experiments.calibration.twin_file import yaml_line
-from hardware.storage.recording_reader import Recording
+from experiments.recordings.reader import Recording
 
 __all__ = ["environment_yaml", "refusal", "report", "summary"]
 
