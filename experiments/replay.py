@@ -29,9 +29,9 @@ from experiments.loop.loop import ClosedLoop
 from experiments.replays.config import ReplayConfig
 from experiments.replays.replay import AHEAD, Replayed, replay
 from hardware.errors import RecordingError
-from hardware.safety.config import WatchedSafety
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.watched import WatchedInterlock
 
 __all__ = ["body", "main"]
 
@@ -58,7 +58,7 @@ def body(config: ReplayConfig, folder: Path) -> None:
     model = replace(model, control_min=bench.control_min, max_pump_rate=min(model.max_pump_rate, bench.max_rate))
     setpoint, make = config.setpoint or _usual(series), _law(config, model)
     log.info("%s: %d readings, %.1f h, setpoint %.3g", source, len(series.od), series.time[-1] / 60.0, setpoint)
-    interlock = Interlock(1, WatchedSafety.of(config.safety), bench)
+    interlock = WatchedInterlock(1, config.safety, bench)
     found = replay(series, temperature, make(), interlock, setpoint, model)
     name = Path(source).name
     charts.save(

@@ -48,6 +48,8 @@ from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.storage import atomic
+from hardware.watch.opened import WatchedFamily
+from hardware.watched import WatchedInterlock
 
 __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack", "with_pair"]
 
@@ -180,6 +182,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     Raises: UserError naming what cannot be read or does not fit.
     """
     family, backend, safety = family_of(config.backend), config.backend, config.safety
+    if config.watch:
+        family = WatchedFamily(family)
     resumed = config.resume is not None
     with frame.refusing(ValueError):
         scenarios, ends = config.schedules(), config.ends()
@@ -277,7 +281,7 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
         volume_ml = config.plant.vessel.volume_ml or config.bench.volume_ml
         tau = volume_ml / (60.0 * config.plant.pump.gain_ml_s)
         row |= {"seed": config.backend.seed, "mu": config.plant.growth.mu, "tau": tau}
-    return f"{decides}{law} on {controlled}", row
+    return f"{decides}{law} {'beside' if config.watch else 'on'} {controlled}", row
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
@@ -354,7 +358,8 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
             volume_ml=volumes_ml,
         )  # fmt: skip
     rim_ml = setup.family.rim_ml(volumes_ml)
-    interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
+    kind = WatchedInterlock if isinstance(setup.family, WatchedFamily) else Interlock
+    interlock = kind(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     for signal in setup.further:
         if isinstance(signal, Share) and plant is not None:
             signal.truth = partial(getattr, plant.culture, "share")

@@ -1,7 +1,7 @@
 """Limits and declared responses of the interlock, and the remedy for each of its reasons."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 
 from conf.schema import check, part, require, setting
@@ -9,7 +9,7 @@ from envs.bench import Bench
 
 __all__ = [
     "DONE", "MAX_SETPOINT", "RAW_MAX", "RAW_MIN", "REMEDIES", "RESPONSES", "WORDS", "Response", "Responses",
-    "SafetyConfig", "WatchedSafety",
+    "SafetyConfig",
 ]  # fmt: skip
 
 
@@ -187,8 +187,6 @@ class SafetyConfig:
         low, high = self.composition_low, self.composition_high
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
-    acts = True  # what it allows is given
-
     def response(self, kind: str) -> Response:
         """Return the response to a reason. Raises: KeyError if there is none of that name."""
         return WORDS[getattr(self.responses, kind, RESPONSES[kind])]
@@ -207,19 +205,3 @@ class SafetyConfig:
         require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")
         require(lost_s >= stale_s, "safety.lost_s", lost_s, f"{stale_s:g} to 14400")
         return stale_s, lost_s
-
-
-@dataclass(frozen=True)
-class WatchedSafety(SafetyConfig):
-    """Limits beside a device that the interlock cannot stop: it tells and goes on."""
-
-    acts = False
-
-    @classmethod
-    def of(cls, safety: SafetyConfig) -> "WatchedSafety":
-        """Take the limits of another config."""
-        return cls(**{f.name: getattr(safety, f.name) for f in fields(safety)})
-
-    def response(self, kind: str) -> Response:
-        """See `SafetyConfig.response`; at most no dose for this sample."""
-        return min(super().response(kind), Response.HOLD)

@@ -188,8 +188,7 @@ class Interlock:
             lines.append(" | ".join(texts) or None)
         kinds = tuple(tuple(reason.kind for reason in reasons) for reasons in found)
         rate = np.where(response == Response.PASS, allowed, 0.0)
-        if self.config.acts:
-            self.budget.grant(rate)
+        self.budget.grant(rate)
         return Ruling(rate, response, lines, kinds, self._heat.off, setpoint)
 
     def confirm(self, receipt: Receipt, now: float) -> None:

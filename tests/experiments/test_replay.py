@@ -19,9 +19,10 @@ from experiments.laws.base import Controller
 from experiments.loop.loop import ClosedLoop
 from experiments.replays.config import ReplayConfig
 from experiments.replays.replay import replay
-from hardware.safety.config import WatchedSafety
+from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.watched import WatchedInterlock
 
 MODEL = EnvConfig()
 
@@ -44,7 +45,7 @@ def recorded(minutes: int = 300) -> tuple[Series, np.ndarray]:
 
 def test_the_controller_that_made_a_recording_decides_as_it_did_and_its_filter_expects_what_came() -> None:
     series, warm = recorded()
-    found = replay(series, warm, law(), Interlock(1, WatchedSafety()), 0.5, MODEL)
+    found = replay(series, warm, law(), WatchedInterlock(1, SafetyConfig()), 0.5, MODEL)
     np.testing.assert_allclose(found.decided_ml, 60.0 * series.pump_rate, atol=1e-9)
     for inside in (found.one, found.ten):
         assert 0.85 <= np.nanmean(inside) <= 1.0
@@ -57,7 +58,7 @@ def test_doses_that_were_not_given_are_never_added_up(kind: str) -> None:
     time = np.arange(200.0)
     fed = Series(time, 0.3 * np.exp(0.01 * time), np.zeros(200), np.arange(200))
     made = registry.build(registry.config(kind), model=MODEL)
-    found = replay(fed, np.full(200, 37.0), made, Interlock(1, WatchedSafety()), 0.4, MODEL)
+    found = replay(fed, np.full(200, 37.0), made, WatchedInterlock(1, SafetyConfig()), 0.4, MODEL)
     assert found.decided_ml.max() <= 1.2 + 1e-9
     assert found.decided_ml[-20:].min() > 0.0
     assert found.given_ml.sum() == 0.0
