@@ -15,9 +15,7 @@ Rows = tuple[int, int | None]
 
 UNITS = {"s": 1 / 60, "min": 1.0, "h": 60.0}  # min
 SPELT = {"sec": "s", "secs": "s", "seconds": "s", "mins": "min", "minutes": "min", "hr": "h", "hrs": "h", "hours": "h"}
-TIME = re.compile(
-    r"(exp|elapsed|experiment)?_?time(_([a-z]+))?|timestamp|minutes|min|hours|hours_since_experiment_created"
-)
+TIME = re.compile(r"((exp|elapsed|experiment)_)?time(_[a-z]+)?|(elapsed_)?(min|minutes|h|hours|seconds)|timestamp")
 OD = ("od_measured", "od", "od_reading", "avg_od_reading")
 PUMP = ("pump_rate_ml_s", "pump_rate")
 DUTY = "pump_{}_rate"  # the Chi.Bio writes the share of full power, not a flow

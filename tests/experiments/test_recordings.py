@@ -46,11 +46,13 @@ def events(total: bool = False) -> Table:
 
 def activity() -> Table:
     names = (
-        "experiment,pioreactor_unit,timestamp,od_reading,temperature_c,add_media_ml,remove_waste_ml,add_alt_media_ml"
+        "experiment,pioreactor_unit,timestamp,od_reading,temperature_c,add_media_ml,remove_waste_ml,add_alt_media_ml,"
+        "timestamp_localtime,hours_since_experiment_created"
     )
     rows = [names.split(",")]
     for t, od, dose in events()[1:]:
-        rows.append(["e", "pio1", moment(float(t)), od, "", dose, dose, ""])
+        hours = f"{round(60.0 * float(t)) / 3600.0:.12g}"  # of whole seconds
+        rows.append(["e", "pio1", moment(float(t)), od, "", dose, dose, "", "2026-07-01 10:00:00.000", hours])
     return rows
 
 
@@ -98,7 +100,7 @@ FORMATS: dict[str, Make] = {
     "totals": lambda spoil: {"data": csv(spoil(events(total=True)))},
     "named": lambda spoil: {
         "data": csv([["Elapsed hours", "scatter", "pump s"], *([f"{float(t) / 60:.6f}", *c] for t, *c in EVENTS[1:])]),
-        "columns": {"time": "Elapsed hours", "od": "scatter", "dose": "pump s"},
+        "columns": {"od": "scatter", "dose": "pump s"},
     },
     "export": lambda spoil: {"data": export(pioreactor_unit_activity_data=spoil(activity()))},
     "tables": lambda spoil: {"data": export(dosing_events=dosings(), od_readings=spoil(readings()))},
