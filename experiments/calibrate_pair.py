@@ -18,10 +18,10 @@ from envs.identification.curves import Plateau, Polynomial
 from envs.identification.screening import Series
 from experiments.cli import files, frame
 from experiments.coculture.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.recordings.reader import Recording, read_recording
 from hardware.errors import RecordingError
 from hardware.storage.atomic import write
 from hardware.storage.marks import read_marks
-from hardware.storage.recording_reader import Recording, read_recording
 
 __all__ = ["CalibratePairConfig", "calibrate_pair", "main"]
 

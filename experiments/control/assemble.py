@@ -40,6 +40,8 @@ from hardware.family import Family, Opening, family_of, report
 from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
+from hardware.watch.opened import WatchedFamily
+from hardware.watched import WatchedInterlock
 
 __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
 
@@ -104,6 +106,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     Raises: UserError naming what cannot be read or does not fit.
     """
     family, backend, safety = family_of(config.backend), config.backend, config.safety
+    if config.watch:
+        family = WatchedFamily(family)
     resumed = config.resume is not None
     with frame.refusing(ValueError):
         scenarios, ends = config.schedules(), config.ends()
@@ -201,7 +205,7 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
         volume_ml = config.plant.vessel.volume_ml or config.bench.volume_ml
         tau = volume_ml / (60.0 * config.plant.pump.gain_ml_s)
         row |= {"seed": config.backend.seed, "mu": config.plant.growth.mu, "tau": tau}
-    return f"{decides}{law} on {controlled}", row
+    return f"{decides}{law} {'beside' if config.watch else 'on'} {controlled}", row
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
@@ -234,7 +238,8 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
             volume_ml=volumes_ml,
         )  # fmt: skip
     rim_ml = setup.family.rim_ml(volumes_ml)
-    interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
+    kind = WatchedInterlock if isinstance(setup.family, WatchedFamily) else Interlock
+    interlock = kind(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
     scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
     loop = ClosedLoop(

@@ -67,11 +67,17 @@ class DeployConfig:
     fsync: bool = setting(True, "write every row to the disk before the next command")
     dry_run: bool = setting(False, "print the timetable and the parts of the run; contact no device, write nothing")
     preflight_only: bool = setting(False, "check the device and stop")
+    watch: bool = setting(
+        False,
+        "read, estimate, decide and warn beside whatever regulates the culture, and send no command; backend=chibio or "
+        "pioreactor",
+    )
     resume: str | None = setting(None, "a run folder to continue, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)
         self.safety.ages_s(self.bench)
+        require(not (self.watch and self.resume), "resume", self.resume, "null with watch=true, which begins anew")
         if family_of(self.backend).simulated:
             self.plant.vessel.of(self.bench.volumes(self.backend.reactors))
         unknown = [name for name in self.bench.volumes_ml if name not in self.backend.reactors]

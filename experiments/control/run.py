@@ -31,6 +31,7 @@ from experiments.reporting import charts
 from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError
 from hardware.storage.marks import NAME, Mark, read_marks
+from hardware.watched import Watched
 
 __all__ = ["BenchMarks", "deploy"]
 
@@ -112,7 +113,10 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
         try:
             reactors.stop()
             left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
-            log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
+            if isinstance(reactors, Watched):
+                log.info("only watched: nothing was switched")
+            else:
+                log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
         except ReactorError as error:
             outcome = f"failed: {error}"
     return outcome

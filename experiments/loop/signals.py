@@ -247,9 +247,11 @@ class Density:
         why = self.law.explain() if isinstance(self.law, Explains) else {}
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
-        alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
-        said = "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
-        return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())
+        warnings: list[str | None] = [None] * sample.rows.size
+        for key, then in (("noted", "the policy goes on"), ("alarm", "the law on a second filter decides")):
+            for n in np.flatnonzero(why.get(key, np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))):
+                warnings[n] = f"filter_alarm: readings do not fit the estimate; reported; {then}"
+        return Findings(why=why, warnings=warnings if any(warnings) else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`."""

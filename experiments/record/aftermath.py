@@ -21,10 +21,10 @@ from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
 from experiments.loop.signals import ESTIMATED, within_2sd
+from experiments.recordings.reader import read_recording
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Table, number, span
 from hardware.errors import RecordingError
-from hardware.storage.recording_reader import read_recording
 
 __all__ = ["INCOMPARABLE", "Believed", "believed", "decisions", "write"]
 

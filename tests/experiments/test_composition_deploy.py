@@ -20,7 +20,7 @@ from experiments.control import assemble, policies, run
 from experiments.deploy import main
 from experiments.loop.metrics import mean_errors
 from experiments.record.recovery import COLUMNS as USUAL
-from hardware.storage.recording_reader import read_recording
+from experiments.recordings.reader import read_recording
 
 F = TypeVar("F", bound=Callable[..., Any])
 WORDS = ("plant=coculture", "scenario=ratio_steps", "composition=proportional", "fsync=false")
