@@ -190,13 +190,13 @@ def test_every_error_of_a_share_stands_under_its_own_heading_on_the_console() ->
     asked |= {"ratio_abs_error_mean": 0.031, "ratio_abs_error_last2h": 0.012, "true_ratio_abs_error_mean": 0.041}
     none = {**asked, "reactor": "M0", "ratio_abs_error_mean": math.nan}
     waves = {**asked, "reactor": "M2", "ratio_setpoint": None, "true_ratio_abs_error_mean": math.nan}
-    table = summary.shares_table([none, asked, waves])
+    table = summary.signals_table([none, asked, waves])
     heads = {"hours": "1.5-3.5", "asked": "0.400", "mean |e|": "0.031", "last 2 h": "0.012", "true |e|": "0.041"}
     heads |= {"OD |e|": "0.007"}
     assert {head: under(head, table, 1) for head in heads} == heads
-    assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M2"]
+    assert [line.split()[0] for line in table.splitlines()] == ["share", "M1", "M2"]
     assert (under("asked", table, 2), under("true |e|", table, 2)) == ("varies", "–")
-    assert summary.shares_table([none]) == ""
+    assert summary.signals_table([none]) == ""
 
 
 def step(minute: float, **told: Any) -> Step:
