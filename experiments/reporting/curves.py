@@ -1,6 +1,6 @@
-"""What the curves in TensorBoard are called, what they mean, and how they are laid out on its custom page.
+"""Tags of TensorBoard's curves, their meaning, and their layout on the custom page.
 
-docs/tensorboard.md explains the same tags to whoever looks at them.
+docs/tensorboard.md explains the same tags to users.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ class Curve:
 
     @property
     def text(self) -> str:
-        """As TensorBoard shows it."""
+        """Text that TensorBoard shows."""
         return f"{self.what}. Unit: {self.unit or 'none'}."
 
 
@@ -89,7 +89,7 @@ PICTURES = {
 
 
 def described(tag: str) -> str:
-    """Describe a tag for TensorBoard; statistics of a population say which."""
+    """Describe a tag for TensorBoard, with the statistic of a population."""
     base, _, end = tag.rpartition("/")
     if base in CURVES and end in POPULATION:
         return f"{CURVES[base].text} {POPULATION[end].capitalize()}."
