@@ -61,7 +61,7 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items = [
         f"regret {worst}{number(regret.max())} %: what the policy costs beyond the exact optimum",
         f"error at rest at its worst setpoint {worst}{number(steady.max())} {unit}",
-        f"the one-line law that looks one period ahead: regret {number(round(law, 4))} %, error "
+        f"the one-line controller that looks one period ahead: regret {number(round(law, 4))} %, error "
         f"{number(summary['myopic_steady_abs_error'])} {unit}",
     ]
     if kind != "density":

@@ -79,7 +79,7 @@ def ended(
     log.info("%s", spent)
     log.info("reached on the reported grid: %s%s: %s", reached, worst if many else "", _verdict(kept, task))
     log.info(
-        "for comparison, the one-line law that looks one period ahead: %s",
+        "for comparison, the one-line controller that looks one period ahead: %s",
         _pair(np.abs(myopic.regret_pct), myopic.steady_abs_error, task.unit),
     )
     log.info("policy %s; figures %s", path, folder / "figures")

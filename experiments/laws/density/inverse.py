@@ -17,7 +17,7 @@ __all__ = ["Inverse", "InverseConfig"]
 
 @dataclass(frozen=True)
 class InverseConfig(ControllerConfig):
-    """The one-line law and what it believes."""
+    """The one-line controller and what it believes."""
 
     kind: str = setting("inverse", "controller")
     levels: int = setting(

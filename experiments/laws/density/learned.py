@@ -99,7 +99,7 @@ def lead(q: np.ndarray) -> dict[str, Array]:
 
 
 class RelativeController:
-    """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s as `Estimator` knows them.
+    """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s of the `Estimator`.
 
     A supervisor stands over it. Where the estimator's surprises do not fit what it believes, or twice its sd of e or s
     leaves the bounds of the certificate, the one-line law u = u_max clip(e + s, 0, 1) decides, on a second filter whose
