@@ -31,14 +31,14 @@ DENSITY = {
     "settling time": "minutes after which |e| stays within 5 % of the setpoint to the end of the window; median over "
     "replicates, a dash where half or more never settle. The paper does not define its band.",
     "steady error": "mean |e| over the last 10 min of a window.",
-    "sensor-noise floor": "the score of the sensor's own error, reading minus what it would show without noise: what a "
-    "culture exactly on the setpoint would be given.",
+    "sensor-noise floor": "the score of the sensor's error alone (reading minus noise-free reading), i.e. of a "
+    "culture exactly on the setpoint.",
     "oracle": "dynamic programming on each vial's own growth rate, pump and volume, seeing the OD without noise and "
     "not knowing setpoints ahead. On the plant nominal nothing that starts a window from the same OD has a lower ISE; "
     "elsewhere it shows what full knowledge of the present is worth.",
-    "noise-free": "the same metrics on the OD that a sensor without noise would have shown.",
-    "interlock": "stands between every controller and the pumps, with the limits of a bench; a reading it does not "
-    "believe gets no dose, whoever proposed one.",
+    "noise-free": "the same metrics on the noise-free OD.",
+    "interlock": "stands between every controller and the pumps, with the limits of a bench; a rejected "
+    "reading gets no dose from any controller.",
     "control effort": "mean change of the pump rate from one decision to the next, µL/s.",
     "paired difference": "controller minus the other, replicate by replicate: both meet the same vials, pumps, sensors "
     "and noise. 95 % interval: Student's t of the mean over replicates, without correction for the number of "
@@ -486,8 +486,8 @@ def _density(out: Page, summary: Row, run: Path) -> None:
     if wide:
         out.section("Every plant")
         out.text(
-            "Model-based controllers and the learned policy believe the model of the configuration (env) "
-            "whatever the plant is; what each plant is stands in the configuration below."
+            "Model-based controllers and the learned policy use the model of the configuration (env) "
+            "on every plant; the configuration below describes each plant."
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
