@@ -71,8 +71,12 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
     files.write_json(folder / "certificate.json", content, indent=None)
     unwritten = ""
     if to is None:
-        why = "a quick one stands nowhere else" if found.quick else f"{source} is part of the program, whose own stays"
-        log.info("the certificate is in the run folder alone: %s; to=FILE writes it elsewhere, too", why)
+        why = (
+            "a quick certificate is written only there"
+            if found.quick
+            else f"{source} is part of the program, whose certificate stays"
+        )
+        log.info("the certificate is in the run folder alone: %s; to=FILE also writes it elsewhere", why)
     else:
         try:
             files.write_json(to, content, indent=None)
@@ -123,7 +127,7 @@ def _row(loop: Any, proof: Proof) -> dict[str, Any]:
         "law, largest": float(proof.law_half_width[held].max()),
         "over the law, largest": float(proof.excess[held].max()),
         "half-width in OD, middle strip": loop.in_od(proof.case, float(proof.half_width[middle])),
-        "periods after the law, largest": float(proof.later[held].max()),
+        "periods after the one-line controller, largest": float(proof.later[held].max()),
         "periods, largest": float(proof.band.periods[held].max()),
     }
 

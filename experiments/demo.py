@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
     _, others = parser.parse_known_args()
     if others:
-        text = f"error: {others[0]}: the demo takes nothing but --help; values go to calibrate, train and deploy"
+        text = f"error: {others[0]}: the demo accepts only --help; give values to calibrate, train and deploy"
         print(text, file=sys.stderr)
         sys.exit(1)
     folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # unique for each demo

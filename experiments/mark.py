@@ -61,10 +61,10 @@ class MarkConfig:
             require(bool(self.reactor), "reactor", repr(self.reactor), f"the one that {measured[0]} is of")
         if self.bottle_ml is not None:
             require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone: mark them one after the other")
-            require(self.minute is None, "minute", self.minute, "null with bottle_ml: a bottle is of now")
+            require(self.minute is None, "minute", self.minute, "null with bottle_ml, which applies now")
         if self.level_ml is not None:
             require(self.share is None, "share", self.share, "null beside level_ml: mark them one after the other")
-            require(self.minute is None, "minute", self.minute, "null with level_ml: a level is of now")
+            require(self.minute is None, "minute", self.minute, "null with level_ml, which applies now")
 
 
 def _minute_now(folder: Path, stored: Any) -> float:
@@ -73,7 +73,7 @@ def _minute_now(folder: Path, stored: Any) -> float:
     from hardware.family import family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
-    over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
+    over = frame.UserError(f"run={folder}: not running; give minute=MINUTE of the run")
     if kind in known() and family(kind).simulated:
         raise over
     rows, _ = read_journal(folder / "journal.jsonl")
@@ -109,7 +109,7 @@ def mark(config: MarkConfig) -> str:
         if minute is None:
             minute = _minute_now(folder, stored)
         elif config.share is not None and minute > (now := _latest(folder, stored)):
-            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; nobody has drawn that sample yet")
+            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; that sample is in the future")
         said = [f"level {config.level_ml:g} mL"] if config.level_ml is not None else []
         sd = None if config.share is None else USUAL_SD if config.sd is None else config.sd
         said += [f"bottle {config.bottle_ml:g} mL"] if config.bottle_ml is not None else []
@@ -119,7 +119,7 @@ def mark(config: MarkConfig) -> str:
         path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd, config.bottle_ml))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
-    taken = "; a run under way takes it over with its next sample, and says so" if said else ""
+    taken = "; a running deployment uses it with its next sample" if said else ""
     return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 

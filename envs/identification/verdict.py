@@ -90,7 +90,7 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
 def _about_bench_and_culture(q: Quality) -> Iterator[tuple[str, str]]:
     """Yield problems of bench and culture, by the lower end of each interval."""
     if q.growth_spread.low > UNSTEADY:
-        yield f"growth wanders by {100.0 * q.growth_spread.low:.0f} % at least from hour to hour", AGAIN
+        yield f"growth rate fluctuates by {100.0 * q.growth_spread.low:.0f} % at least from hour to hour", AGAIN
     if q.dose_spread.low > UNEVEN:
         said = f"doses spread by {100.0 * q.dose_spread.low:.0f} % at least"
         yield said, "look at the feed's tube and needle, and measure the pump (python -m experiments.calibrate_pump)"

@@ -70,7 +70,7 @@ def _load(path: Path) -> None:
     except Exception as error:
         del sys.modules[module]
         line = _line_in(path, error)
-        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; mend that file") from None
+        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; correct that file") from None
     _loaded[path] = module
 
 

@@ -58,7 +58,7 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Queue the text; return its length."""
-        told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n"
+        told = f"... {self._lines} lines are missing here, because the screen was blocked; the log file has all\n"
         room = self.outlet.put((told * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
         self._lines = 0 if room else self._lines + text.count("\n")
         return len(text)

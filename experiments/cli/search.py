@@ -105,7 +105,7 @@ class Search(Sweeper):
         with self._alone():
             for trial in study.get_trials(deepcopy=False):
                 if len(taken) < self.at_once and not trial.state.is_finished() and self._hold(trial.number):
-                    log.info("trial %d goes on: its process is gone", trial.number)
+                    log.info("trial %d continues: its process has ended", trial.number)
                     taken.append(trial)
             while len(taken) < self.at_once and len(study.get_trials(deepcopy=False)) < self.trials:
                 trial = study.ask(self.space)

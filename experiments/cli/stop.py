@@ -173,10 +173,10 @@ class Pause:
         old = self._before[number]
         ours = number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
         if self._came and ours and multiprocessing.parent_process() is None:
-            print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
+            print("stopped at once; earlier saved data is complete", file=sys.stderr, flush=True)
             os._exit(STATUS)
         if not self._came:
-            print(f"stopping {self._until}; once more stops at once", flush=True)
+            print(f"stopping {self._until}; a second signal stops at once", flush=True)
         self._came.append(number)
 
     def pass_on(self) -> None:

@@ -97,7 +97,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
             kept = [a for a in kept if not a.startswith("hydra.launcher.")]
         return Sweep(before.folder, command, kept + new)
     if folder and len(plain) < len(given):
-        raise UserError(f"resume={folder}: no sweep; a single run goes on without -m")
+        raise UserError(f"resume={folder}: no sweep; continue a single run without -m")
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
@@ -226,7 +226,7 @@ def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
     done = sum(job.state == "finished" for job in found)
     line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
     if any(job.state == "running" for job in found):
-        line += f"; {sum(job.state == 'running' for job in found)} still at work in other processes"
+        line += f"; {sum(job.state == 'running' for job in found)} still running in other processes"
     over = ("finished", "running") if expected is not None else ("finished", "running", "failed")
     if all(job.state in over for job in found):
         return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"

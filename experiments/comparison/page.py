@@ -46,10 +46,10 @@ DENSITY = {
     "±": "one standard deviation over replicates.",
 }
 ESTIMATES = (
-    ("error_2sd_pct", "Decisions in which e lay within two of its own sd of the truth, %"),
-    ("share_2sd_pct", "Decisions in which s lay within two of its own sd of the share that holds at rest, %"),
-    ("supervised_pct", "Decisions by the supervisor's law, %"),
-    ("alarm_pct", "Decisions by it because of surprises, %"),
+    ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
+    ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
+    ("supervised_pct", "Decisions by the supervisor's controller, %"),
+    ("alarm_pct", "Of these, because of innovations, %"),
 )
 RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
 """Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
