@@ -166,7 +166,7 @@ class Plant:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
           temperature: of vial and thermostat, degC, as `od`; None = `start_temperature` of the config.
           share: of the second strain, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
-        Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below
+        Fault switches, bottle content and drawn parameters stay. Raises: ValueError for an OD below
         0 or a share outside 0 to 1.
         """
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)

@@ -21,8 +21,8 @@ from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
 
-ELSEWHERE = ("env", "agent")  # kinds that docs/tasks.md and docs/extending.md describe
-SINGULAR = {"studies": "study"}  # the others lose their s
+ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
+SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
 This page is generated from the fields of the config dataclasses and the presets of `conf/`, and a test compares it with

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK_MIN = 10.0
-LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
-NOISELESS = 1e-5  # scores below are those of a plant without noise
+LEAST = 1e-9  # end of an interval that reaches zero on a logarithmic axis
+NOISELESS = 1e-5  # lower scores are those of a plant without noise
 
 MARKS = {
     "dqn": (COLOURS[0], "o"),

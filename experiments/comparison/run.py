@@ -147,7 +147,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
             own = [cell for cell in wanted if cell.signal == signal]
             for name, followed in policies_of(config, sorted({cell.controller for cell in own}), folder).items():
                 loops.start([cell for cell in own if cell.controller == name], followed)
-        loops.start([cell for cell in density if cell.controller not in names])  # they run while agents are trained
+        loops.start([cell for cell in density if cell.controller not in names])  # they run during the training
         found, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
         shown += learning
         for name in sorted(names):

@@ -20,7 +20,7 @@ METRICS = ("ise", "itae")
 TOLD = {
     "supervised_pct": "supervised", "alarm_pct": "alarm", "error_2sd_pct": "error", "share_2sd_pct": "growth_share",
 }  # fmt: skip
-NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
+NEGLIGIBLE = 1e-6  # smallest mean for a difference in percent
 
 
 class Spread:
@@ -155,7 +155,7 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
 
 
 def _partners(trials: Sequence[T], against: str) -> list[tuple[T, T]]:
-    """Every trial with that of `against` on the same vials."""
+    """Return every trial with the trial of `against` on the same vials."""
     of = {t.cell.vials: t for t in trials if t.cell.controller == against}
     return [(t, of[t.cell.vials]) for t in trials if t.cell.controller != against and t.cell.vials in of]
 

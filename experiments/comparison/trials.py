@@ -48,12 +48,12 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 SUPERVISED = ("supervised", "alarm")
-LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
+LEAST_NOISE = 1e-9  # OD, of a sensor without noise
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is run once: names of the law that is compared, plant and scenario, and of the signal that it holds."""
+    """One closed loop: names of controller, plant, scenario and controlled signal."""
 
     controller: str
     plant: str
@@ -174,7 +174,7 @@ def closed(
 
 
 def record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
-    """Run a loop to its end; return the minutes of its schedule, (K,), and what is seen at each, (N, K) by name."""
+    """Run a loop to its end; return the minutes of its schedule, (K,), and the values at each, (N, K) by name."""
     schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
     minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
     stored: dict[str, Array] = {}
@@ -262,7 +262,7 @@ RUNS: dict[str, Run] = {"density": _density}
 
 
 def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
-    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    """Run one closed loop of a benchmark; it depends only on its arguments, so every process gives the same."""
     guests.load("experiments.comparison")
     return RUNS[cell.signal](config, cell, followed)
 

@@ -17,7 +17,7 @@ from experiments.laws.density.estimator import EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
-WATCHED = 2.0  # sd of an estimate that count as its error
+WATCHED = 2.0  # number of sd that count as the error of an estimate
 LOUDER = 1.5  # loudness of the policy's filter over that of the second one, above which the second one knows better
 NOTED = 36.0  # loudness that is worth a note, whoever knows better
 
@@ -169,7 +169,7 @@ class RelativeController:
             each.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """Whether the supervisor decided, what the policy saw with its sd, and the estimates behind it, each (N,)."""
+        """Return whether the supervisor decided, the policy's inputs with their sd, and the estimates, each (N,)."""
         flags = {"supervised": self._supervised, "alarm": self._alarm, "noted": self._noted}
         said = {name: flag.astype(np.float64) for name, flag in flags.items()}
         (error, share), (error_sd, share_sd) = self._seen.T.copy(), self._sure.T.copy()
