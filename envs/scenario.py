@@ -35,6 +35,11 @@ class Scenario:
     recovery_od: float = setting(
         0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
     )
+    recovery: str = setting(
+        "grow",
+        "dilute: it grows beyond `recovery_od` by the share `settled_band`, and full pump dilutes it to there",
+        choices=("grow", "dilute"),
+    )
     recovery_limit_min: float = setting(600.0, "how long that may take", "min", above=0.0)
     ratios: tuple[float | None, ...] = setting(
         (),
@@ -80,6 +85,8 @@ class Scenario:
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
+        diluted = self.recovery == "grow" or self.recovery_od > 0.0
+        require(diluted, "scenario.recovery_od", self.recovery_od, "> 0 with scenario.recovery=dilute")
         alone = self.composed or None not in self.temperatures
         require(alone, "scenario.temperatures", self.temperatures, "numbers where no share is asked for")
         for name in ("until", "outputs", "ratios"):
