@@ -6,7 +6,7 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 
 | observation | what it is | actions |
 |---|---|---|
-| od, setpoint | OD x and setpoint r | pump rates, mL/s |
+| od, setpoint (, next_setpoint, minutes_to_change) | OD x, setpoint r, and the change (envs/preview.py) | mL/s |
 | error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | shares of it |
 | logit_share, temperature, rate, logit_setpoint (, logit_next, minutes_to_change) | envs/coculture/task.py | degC |
 """
@@ -22,16 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprints", "load",
-    "save",
+    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "PREVIEW", "RELATIVE", "Policy", "PolicyError",
+    "fingerprints", "load", "save",
 ]  # fmt: skip
 
 FORMAT = 2
 ABSOLUTE = ("od", "setpoint")
+PREVIEW = (*ABSOLUTE, "next_setpoint", "minutes_to_change")
 RELATIVE = ("error", "growth_share")
 COCULTURE = ("logit_share", "temperature", "rate", "logit_setpoint")
 COCULTURE_PREVIEW = (*COCULTURE, "logit_next", "minutes_to_change")
-KNOWN = (ABSOLUTE, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
+KNOWN = (ABSOLUTE, PREVIEW, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
 
 
 class PolicyError(Exception):

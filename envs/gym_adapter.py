@@ -14,6 +14,7 @@ PREVIEW = {"control_min": 30.0, "episode_steps": 24, "preview_min": 360.0}
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
+    "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
     "Coculture-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", {}),
     "CoculturePreview-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", PREVIEW),
 }

@@ -6,12 +6,15 @@ from typing import Any
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.coculture.task import CocultureConfig
+from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 
 __all__ = ["AGENTS", "ENVS", "TrainConfig", "agent_schema", "env_schema"]
 
-ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
+ENVS: dict[str, type[Any]] = {
+    "density": EnvConfig, "relative": RelativeConfig, "preview": PreviewConfig, "coculture": CocultureConfig,
+}  # fmt: skip
 
 
 def env_schema(kind: str, key: str = "env") -> Any:

@@ -13,12 +13,14 @@ from dqn.hindsight import Relabel
 from dqn.policy import Policy
 from dqn.trainer import TrainingEnv
 from envs.coculture.task import CocultureConfig
+from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.training.coculture import Coculture
 from experiments.training.config import ENVS
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluated
+from experiments.training.preview import Preview
 from experiments.training.relative import Relative
 
 __all__ = ["Task", "add", "kind", "of"]
@@ -75,6 +77,7 @@ class Task(Evaluated, Protocol):
 TASKS: dict[type[Any], Callable[[Any], Task]] = {
     EnvConfig: DensityTask,
     RelativeConfig: Relative,
+    PreviewConfig: Preview,
     CocultureConfig: Coculture,
 }
 

@@ -12,7 +12,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,9 @@ import torch
 from conf.schema import check, setting
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
+from envs.optimum import solve_episode
+from envs.preview import half_way, program_of
+from envs.task import step_factors
 from experiments.cli import files
 from experiments.cli.stop import Workers
 from experiments.laws import registry
@@ -32,6 +35,7 @@ from experiments.train import main as train
 from experiments.training import build, tasks
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Act, Evaluation
+from experiments.training.preview import Preview
 from experiments.training.session import Session
 from tests.entry import command
 from tests.studies.results import leave
@@ -41,7 +45,7 @@ __all__ = ["LearnersConfig", "learners", "main", "one_line", "receding"]
 log = logging.getLogger(__name__)
 
 TASKS = {
-    "sim": "Bioreactor-v0", "relative": "Relative-v0", "coculture": "Coculture-v0",
+    "sim": "Bioreactor-v0", "relative": "Relative-v0", "preview": "BioreactorPreview-v0", "coculture": "Coculture-v0",
     "coculture_preview": "CoculturePreview-v0",
 }  # fmt: skip
 RIVALS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -61,6 +65,7 @@ WITHOUT = {
 }
 OURS, LAW = "this program's DQN", "one look ahead, one line"
 PLANS = (1, 3, 6)  # h
+MINUTES = (10, 20, 30)  # of a plan for the density
 COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
 
 
@@ -79,6 +84,7 @@ class LearnersConfig:
         choices=tuple(WITHOUT),
     )
     seeds: int = setting(5, "of each", within=(1, 1000))
+    seed: int = setting(0, "first of them", at_least=0)
     workers: int = setting(0, "processes; 0 for one per core", within=(0, 256))
 
     def __post_init__(self) -> None:
@@ -103,10 +109,21 @@ class Job:
 def jobs(c: LearnersConfig) -> list[Job]:
     """All trainings, short ones first."""
     kinds = [(t, r, n) for n in sorted(c.steps) for t in c.tasks for r in ("ours", *c.rivals)]
-    kinds += [(t, "ours", 0) for t in c.tasks]
+    kinds += [(t, "ours", 0) for t in c.tasks if own_steps(t) not in c.steps]
     kinds += [("coculture_preview", f"without {part}", 0) for part in c.without if "coculture_preview" in c.tasks]
     kinds += [(t, r, c.long_steps) for t in c.tasks for r in c.long]
-    return [Job(*kind, seed) for kind in dict.fromkeys(kinds) for seed in range(c.seeds)]
+    return [Job(*kind, seed) for kind in dict.fromkeys(kinds) for seed in seeds(c)]
+
+
+def seeds(c: LearnersConfig) -> range:
+    """Of every training."""
+    return range(c.seed, c.seed + c.seeds)
+
+
+@cache
+def own_steps(task: str) -> int:
+    """Steps for which our agent is trained on a task unless it is told otherwise."""
+    return int(train.config([f"env={task}"]).agent.total_steps)
 
 
 @cache
@@ -175,7 +192,38 @@ def laws(task: str) -> list[list[str]]:
         costs = {f"`{kind}`, one line": one_line(kind, config, start) for kind in kinds}
         costs |= {f"a plan of {h} h, made anew": receding(h, config, start) for h in PLANS if config.preview_min}
         rows += [(name, number(round(100.0 * (cost / optimum - 1.0), 3)), "–") for name, cost in costs.items()]
+    if isinstance(known, Preview):
+        plans = {"`half_way`, one line": half_way_law(known)}
+        plans |= {f"a plan of {m} min, made anew": planned(known, m) for m in MINUTES}
+        scores = [(name, report(act, 1)) for name, act in plans.items()]
+        rows += [(name, number(round(float(s.regret_pct[0]), 3)), number(s.steady_abs_error[0])) for name, s in scores]
     return [[TASKS[task], name, "–", regret, "–", steady, "–"] for name, regret, steady in rows]
+
+
+def half_way_law(task: Preview) -> Act:
+    """Look one period ahead towards the next setpoint as soon as half of the change takes as long as is left."""
+    moves = np.log(step_factors(task.config))
+    full = float(moves.max() - moves.min())
+
+    def act(observation: Any) -> Any:
+        now, following, left = (observation[..., k] for k in (1, 2, 3))
+        begun = left / task.config.control_min <= half_way(now, following, full, float(moves.max()) / full)
+        return task.myopic(np.stack([observation[..., 0], np.where(begun, following, now)], axis=-1))
+
+    return act
+
+
+def planned(task: Preview, minutes: int) -> Act:
+    """Follow the optimal plan that ends after so many minutes, made anew before each decision."""
+    steps = round(minutes / task.config.control_min)
+    solved = cache(lambda *program: solve_episode(replace(task.config, episode_steps=steps), np.array(program)))
+
+    def act(observation: Any) -> Any:
+        programs = program_of(task.config.control_min, observation[0, :, 1:], steps).T
+        chosen = [solved(*p).act(od, steps)[0] for p, od in zip(programs, observation[0, :, :1], strict=True)]
+        return np.array([chosen])
+
+    return act
 
 
 def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
@@ -220,7 +268,7 @@ def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[st
     """Rows of what is finished with all its seeds: of each task by regret, the lowest first."""
     rows: list[tuple[int, float, list[str]]] = []
     for kind in dict.fromkeys((job.task, job.learner, job.steps) for job in jobs(c)):
-        each = [found[job] for job in (Job(*kind, seed) for seed in range(c.seeds)) if job in found]
+        each = [found[job] for job in (Job(*kind, seed) for seed in seeds(c)) if job in found]
         if len(each) < c.seeds:
             continue
         task, learner, _ = kind
@@ -244,7 +292,7 @@ def by_task(rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
     tasks = list(dict.fromkeys(row[0] for row in rows))
     found: dict[tuple[str, str], dict[str, str]] = {}
     for task, name, steps, regret, worst, *_ in rows:
-        own = name.startswith(OURS) and steps == f"{train.config([f'env={names[task]}']).agent.total_steps}"
+        own = name.startswith(OURS) and steps == f"{own_steps(names[task])}"
         for label in dict.fromkeys(["its own"] * own + [steps] * (not own or name == OURS)):
             found.setdefault((name, label), {})[task] = regret if worst == "–" else f"{regret} ({worst})"
     last = {key: float(cells[tasks[-1]].split()[0]) if tasks[-1] in cells else math.inf for key, cells in found.items()}
