@@ -166,9 +166,9 @@ class Density:
     A culture of volume s V answers to a rate s u as one of V does to u, since tau = V/60. So a law whose model is of V
     decides for every volume.
 
-    A change of the setpoint that is known ahead is aimed at so early that OD is half-way when the setpoint changes
-    (`envs.preview.half_way`): the integral of the squared error is a quarter of what it is without. OD then moves by
-    s B a period up and (1 - s) B down in ln OD, with growth share s and full pump B as the law estimates them.
+    A change of the setpoint that is known ahead is begun so early that OD is half-way when it comes (`half_way`): the
+    integral of the squared error is a quarter of what it is without. The aim is the next setpoint where OD lags behind
+    that way, else the way's next OD, by growth share and full pump as the law estimates them.
 
     Args: law: decides on the pump rate; what it can do beyond is asked of it. scale: s, (N,) or one for all.
       max_rate: largest rate, mL/s. period_min: control period.
@@ -216,11 +216,11 @@ class Density:
     def _aim(self, sample: Sample) -> Array:
         if sample.following is None or sample.left_min is None or not isinstance(self.law, Estimates):
             return sample.setpoint
-        full, share = self.law.estimator.full_pump, self.law.estimator.relative(sample.setpoint)[1]
-        lead = half_way(sample.setpoint, sample.following, full, share)
-        nearest = sample.left_min <= (lead + 0.5) * self._period_min
-        begun = nearest & np.isfinite(sample.left_min)
-        return np.where(begun, sample.following, sample.setpoint)
+        full, (error, share) = self.law.estimator.full_pump, self.law.estimator.relative(sample.setpoint)
+        now, left = (sample.setpoint, sample.following), sample.left_min / self._period_min
+        here, ahead = (half_way(*now, left - later, full, share) for later in (0.0, 1.0))
+        behind = np.sign(sample.following - sample.setpoint) * (error * full - np.log(here / sample.setpoint)) < 0.0
+        return np.where(behind & (ahead != sample.setpoint), sample.following, ahead)
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """See `Signal.find`; in a simulation also what e and s truly are, where the law estimates them."""

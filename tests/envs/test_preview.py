@@ -29,13 +29,13 @@ def test_an_episode_is_judged_by_the_setpoint_in_force_and_the_change_comes_when
 
 @pytest.mark.parametrize(("now", "following"), [(0.5, 0.8), (0.9, 0.3), (0.2, 1.0)])
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_no_other_lead_has_a_smaller_sum_of_squared_errors_than_half_way(now: float, following: float, share: float):
-    """On a fine grid of time, where the culture moves from one setpoint to the other as fast as pump or growth can."""
-    speed = 0.06 * (share if following > now else share - 1.0)
-    time = np.arange(-150.0, 150.0, 0.02)
-    leads = np.arange(0.0, 130.0, 0.25)
-    moved = now * np.exp(speed * np.maximum(time + leads[:, None], 0.0))
-    od = np.clip(moved, min(now, following), max(now, following))
-    cost = np.square(od - np.where(time < 0.0, now, following)).sum(axis=1)
-    lead = half_way(np.array([now]), np.array([following]), 0.06, share)[0]
-    assert leads[cost.argmin()] == pytest.approx(lead, abs=0.3)
+def test_begun_earlier_or_later_the_best_way_costs_more(now: float, following: float, share: float) -> None:
+    """On a fine grid of time; it moves as fast as growth (share of .06 a period) or full pump can."""
+    left, earlier = np.arange(150.0, -150.0, -0.02), np.arange(-5.0, 5.1, 0.25)
+    od = half_way(np.array(now), np.array(following), left - earlier[:, None], 0.06, share)
+    cost = np.square(od - np.where(left > 0.0, now, following)).sum(axis=1)
+    assert earlier[cost.argmin()] == 0.0
+    moves = np.diff(np.log(od[0])) / 0.02
+    fastest = 0.06 * (share if following > now else share - 1.0)
+    assert np.abs(moves)[np.abs(moves) > 1e-9][1:-1] == pytest.approx(abs(fastest))
+    assert (od[0, 0], od[0, -1]) == (now, following)

@@ -40,7 +40,7 @@ from experiments.training.session import Session
 from tests.entry import command
 from tests.studies.results import leave
 
-__all__ = ["LearnersConfig", "learners", "main", "one_line", "receding"]
+__all__ = ["LearnersConfig", "learners", "main", "one_line", "planned"]
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +64,10 @@ WITHOUT = {
     "falling rate": ["agent.learning_rate_end=null"],
 }
 OURS, LAW = "this program's DQN", "one look ahead, one line"
-PLANS = (1, 3, 6)  # h
-MINUTES = (10, 20, 30)  # of a plan for the density
+PLANS = {
+    "preview": {"10 min": 10, "20 min": 20, "30 min": 30},
+    "coculture_preview": {"1 h": 60, "3 h": 180, "6 h": 360},
+}
 COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
 
 
@@ -183,45 +185,45 @@ def rival(job: Job) -> tuple[int, Act]:
 def laws(task: str) -> list[list[str]]:
     """Rows of the laws that learn nothing."""
     known, report = evaluation(task)
-    found = report(known.myopic, 1)
-    regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
-    rows = [(LAW, number(round(regret, 3)), number(steady))]
+    acts: dict[str, Act] = {LAW: known.myopic}
+    acts |= {"`half_way`, one line": half_way_law(known)} if isinstance(known, Preview) else {}
+    acts |= {f"a plan of {name}, made anew": planned(known, m) for name, m in PLANS.get(task, {}).items()}
+    scores = [(name, report(act, 1)) for name, act in acts.items()]
+    rows = [(name, float(s.regret_pct[0]), number(float(s.steady_abs_error[0]))) for name, s in scores]
     if isinstance(known, Coculture):
-        config, start, optimum = known.config, report.start, report.optimum_cost
-        kinds = ("midpoint" if config.preview_min else "inverse_dynamics", "proportional", "pi")
-        costs = {f"`{kind}`, one line": one_line(kind, config, start) for kind in kinds}
-        costs |= {f"a plan of {h} h, made anew": receding(h, config, start) for h in PLANS if config.preview_min}
-        rows += [(name, number(round(100.0 * (cost / optimum - 1.0), 3)), "–") for name, cost in costs.items()]
-    if isinstance(known, Preview):
-        plans = {"`half_way`, one line": half_way_law(known)}
-        plans |= {f"a plan of {m} min, made anew": planned(known, m) for m in MINUTES}
-        scores = [(name, report(act, 1)) for name, act in plans.items()]
-        rows += [(name, number(round(float(s.regret_pct[0]), 3)), number(s.steady_abs_error[0])) for name, s in scores]
-    return [[TASKS[task], name, "–", regret, "–", steady, "–"] for name, regret, steady in rows]
+        kinds = ("midpoint" if known.config.preview_min else "inverse_dynamics", "proportional", "pi")
+        costs = {f"`{kind}`, one line": one_line(kind, known.config, report.start) for kind in kinds}
+        rows += [(name, 100.0 * (cost / report.optimum_cost - 1.0), "–") for name, cost in costs.items()]
+    return [[TASKS[task], name, "–", number(round(regret, 3)), "–", steady, "–"] for name, regret, steady in rows]
 
 
 def half_way_law(task: Preview) -> Act:
-    """Look one period ahead towards the next setpoint as soon as half of the change takes as long as is left."""
+    """Look one period ahead towards the best way, which an error that counts after each step moves by half a period."""
     moves = np.log(step_factors(task.config))
     full = float(moves.max() - moves.min())
 
     def act(observation: Any) -> Any:
         now, following, left = (observation[..., k] for k in (1, 2, 3))
-        begun = left / task.config.control_min <= half_way(now, following, full, float(moves.max()) / full)
-        return task.myopic(np.stack([observation[..., 0], np.where(begun, following, now)], axis=-1))
+        way = half_way(now, following, left / task.config.control_min - 0.5, full, float(moves.max()) / full)
+        return task.myopic(np.stack([observation[..., 0], way], axis=-1))
 
     return act
 
 
-def planned(task: Preview, minutes: int) -> Act:
+def planned(task: Any, minutes: float) -> Act:
     """Follow the optimal plan that ends after so many minutes, made anew before each decision."""
-    steps = round(minutes / task.config.control_min)
-    solved = cache(lambda *program: solve_episode(replace(task.config, episode_steps=steps), np.array(program)))
+    c, steps = task.config, round(minutes / task.config.control_min)
+    solved = cache(lambda *program: solve_episode(replace(c, episode_steps=steps), np.array(program)))
 
     def act(observation: Any) -> Any:
-        programs = program_of(task.config.control_min, observation[0, :, 1:], steps).T
-        chosen = [solved(*p).act(od, steps)[0] for p, od in zip(programs, observation[0, :, :1], strict=True)]
-        return np.array([chosen])
+        rows, known = observation[0], -3  # the last three columns are the program
+        program = program_of(c.control_min, rows[:, known:], steps)
+        if isinstance(task, Coculture):
+            model, state = transitions(c, Grid()), rows[:, :known]
+            value = cost_to_go(model, share(program))[1]
+            return best_action(c, model, value, state, share(program[0]))[None]
+        plans = [solved(*each) for each in program.T]
+        return np.array([[int(plan.act(od, steps)[0]) for plan, od in zip(plans, rows[:, :1], strict=True)]])
 
     return act
 
@@ -246,21 +248,6 @@ def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
             state = advance(config, state, target, 1.0)
         total += np.square(share(state[:, 0]) - wanted)
         goal = passed(config, goal)
-    return float(total.mean())
-
-
-def receding(hours: int, config: CocultureConfig, start: Array) -> float:
-    """The same of the optimal plan that ends after so many hours, made anew before each decision."""
-    model, state, ahead = transitions(config, Grid()), start[:, :3], round(60.0 * hours / config.control_min)
-    program, goal = np.empty((config.episode_steps + ahead, len(start))), start[:, 3:]
-    for k in range(len(program)):
-        program[k], goal = share(goal[:, 0]), passed(config, goal)
-    total = np.zeros(len(start))
-    for k in range(config.episode_steps):
-        value = cost_to_go(model, program[k : k + ahead])[1]
-        action = best_action(config, model, value, state, program[k])
-        state = advance(config, state, config.targets()[action], config.control_min)
-        total += np.square(share(state[:, 0]) - program[k])
     return float(total.mean())
 
 
