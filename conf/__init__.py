@@ -1,4 +1,5 @@
-"""The settings of every command: presets in YAML, and how a config states and checks its own values.
+"""Settings of every command: presets in YAML, and the declaration and check of config values.
 
-Free of Hydra and of everything numerical, so every package may import it; it imports nothing of ours.
+It needs neither Hydra nor numerical libraries and imports no other package of the project, so every package may import
+it.
 """

@@ -1,4 +1,4 @@
-"""The presets of conf/ as plain values, for readers that do without Hydra."""
+"""The presets of conf/ as plain values, without Hydra."""
 
 import re
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 __all__ = [
-    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owner", "place",
+    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owners", "place",
     "program", "sentence",
 ]  # fmt: skip
 
@@ -20,21 +20,21 @@ ROOT = Path(str(resources.files("conf")))
 
 @dataclass(frozen=True)
 class Added:
-    """A preset that is not a file of conf/: what it changes, and what it is, in a sentence."""
+    """A preset that is not a file of conf/: its changes and a sentence that describes it."""
 
     values: dict[str, Any]
     what: str
 
 
 _added: dict[str, Added] = {}
-_placed: dict[str, Path] = {}  # command -> its file, where that is not in conf/
+_placed: dict[str, Path] = {}  # command -> its file, if that is not in conf/
 
 
 def add(name: str, values: Mapping[str, Any], what: str) -> None:
-    """Make a preset known for this process, in place of one of the same name that was added before.
+    """Add a preset for this process; replace an added preset of the same name.
 
     Args: name: group and option, "controller/mine"; values, what: as of `Added`.
-    Raises: ValueError for a group that no command takes, or a preset that conf/ has already.
+    Raises: ValueError for an unknown group, or a preset that exists in conf/.
     """
     group, _, option = name.rpartition("/")
     known = _files()
@@ -46,12 +46,12 @@ def add(name: str, values: Mapping[str, Any], what: str) -> None:
 
 
 def added() -> dict[str, Added]:
-    """Every preset that was added, by group and option."""
+    """Return all added presets by group and option."""
     return dict(_added)
 
 
 def groups() -> dict[str, list[str]]:
-    """Config groups and their presets: {"env": ["sim"], ...}. Hydra's own groups are not among them."""
+    """Config groups and their presets: {"env": ["sim"], ...}. Without Hydra's own groups."""
     found = _files()
     for name in _added:
         group, _, option = name.rpartition("/")
@@ -84,7 +84,7 @@ def sentence(name: str) -> str:
 
 
 def place(path: Path) -> None:
-    """Make the command of a file beside its module known. Args: path: NAME.yaml of this source tree."""
+    """Register the command of a file that is beside its module. Args: path: NAME.yaml of this source tree."""
     _placed[path.stem] = path
 
 
@@ -100,27 +100,27 @@ def program(command: str) -> str:
 
 
 def commands() -> list[str]:
-    """Every command that has a file of its own in conf/."""
+    """List the commands that have a file in conf/."""
     return [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
 
 
 def chosen(command: str) -> dict[str, str | None]:
-    """Map each group that a command composes, at the place of its own, to the option it starts with."""
+    """Map each group that a command composes under its own name to its initial option."""
     root = yaml.safe_load(_file(command).read_text(encoding="utf-8")) or {}
     entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
     found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
     return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
 
 
-def owner(name: str) -> str | None:
-    """Return the command that a recipe is for (line `# @command NAME`); None for a preset that serves any command.
+def owners(name: str) -> tuple[str, ...]:
+    """Return the commands of a recipe (line `# @command NAME,NAME`), or () for a preset of any command.
 
     Args: name: group and option, "experiment/paper".
     """
     if name in _added:
-        return None
-    found = re.search(r"^# @command (\w+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
-    return found[1] if found else None
+        return ()
+    found = re.search(r"^# @command ([\w,]+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+    return tuple(found[1].split(",")) if found else ()
 
 
 def companion(name: str) -> str | None:
@@ -137,14 +137,14 @@ def companion(name: str) -> str | None:
 
 def options(command: str, group: str) -> list[str]:
     """List the presets of a group that a command accepts."""
-    return [option for option in groups()[group] if owner(f"{group}/{option}") in (None, command)]
+    return [option for option in groups()[group] if command in (owners(f"{group}/{option}") or (command,))]
 
 
 def load(name: str) -> dict[str, Any]:
-    """Load what a preset changes, together with the presets of its group that it starts from.
+    """Load the changes of a preset, including those of the presets that it starts from.
 
     Args: name: group and option, "plant/bench".
-    Raises: ValueError naming the presets of the group.
+    Raises: ValueError with the presets of the group.
     """
     group, _, option = name.rpartition("/")
     known = groups().get(group, [])

@@ -1,9 +1,9 @@
-"""How a config dataclass states its values once: default, meaning, unit and range stand in the field.
+"""Declaration of config values: each dataclass field states default, meaning, unit and range.
 
     mu: float = setting(0.03, "specific growth rate", "1/min", above=0.0, at_most=0.1)
 
-`check` refuses what is out of range, `build` makes a config from plain values, and the command line's help and
-docs/configuration.md are written from the same fields.
+`check` refuses a value out of range, `build` makes a config from plain values. The help of the command line and
+docs/configuration.md are generated from the same fields.
 """
 
 import copy
@@ -18,7 +18,7 @@ __all__ = ["Entry", "build", "check", "entries", "part", "require", "setting"]
 
 T = TypeVar("T")
 
-ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # of everybody alike (envs/bench.py)
+ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # for all parts (envs/bench.py)
 TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
 
 
@@ -27,10 +27,10 @@ Kinds = Callable[[str, str], Any]
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a field is and which values it takes. Bounds of a tuple hold for each of its entries.
+    """Meaning of a field and its allowed values. Bounds of a tuple apply to each of its entries.
 
-    interval: a pair [low, high], rising. some: a tuple that may not be empty. kinds: of a part, or of parts by name,
-    the default config of each `kind`, called with kind ("": not said) and key; raises ValueError naming what there is.
+    interval: a pair [low, high], rising. some: a tuple that may not be empty. kinds: function of kind ("": not given)
+    and key that returns the default config of a part, or of parts by name; raises ValueError with the known kinds.
     """
 
     what: str
@@ -46,7 +46,7 @@ class Meaning:
     kinds: Kinds | None = None
 
     def holds(self, given: Any) -> bool:
-        """Whether a value is in range; nan is in none."""
+        """Return whether a value is in range; nan never is."""
         if given is None:
             return True
         if isinstance(given, Sequence) and not isinstance(given, str):
@@ -96,7 +96,7 @@ class Meaning:
 
 @dataclass(frozen=True)
 class Entry:
-    """One field of a config: its name, what was said of it (nothing without `setting` or `part`), and its value."""
+    """One field of a config: its name, its declaration (empty without `setting` or `part`), and its value."""
 
     name: str
     said: Meaning
@@ -133,15 +133,15 @@ def part(factory: Callable[[], T], what: str, kinds: Kinds | None = None) -> T:
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
-    """Check a rule, such as one that joins several fields. Raises: ValueError with the checker's words."""
+    """Check a rule, e.g. for several fields together. Raises: ValueError with the checker's message."""
     if not holds:
         raise ValueError(f"{key} = {list(given) if isinstance(given, tuple) else given}: allowed {allowed}")
 
 
 def check(config: Any, prefix: str = "") -> None:
-    """Check every field of a config dataclass against its own range; called by `__post_init__`.
+    """Check every field of a config dataclass against its range; called by `__post_init__`.
 
-    Args: prefix: where the config stands, "plant.pump"; "" for that of a command.
+    Args: prefix: key of the config, "plant.pump"; "" for the config of a command.
     Raises: ValueError `prefix.key = value unit: allowed RANGE`.
     """
     for entry in (e for e in entries(config) if not e.said.holds(e.value)):
@@ -153,13 +153,12 @@ def check(config: Any, prefix: str = "") -> None:
 def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
     """Build a config dataclass with some of its values replaced; parts are given as nested mappings.
 
-    Numbers may be given as text and lists stand for tuples, as YAML and command lines have them.
+    Numbers may be text and tuples may be lists, as in YAML and command lines.
 
     Args:
-      default: an instance; what `values` leaves out stays as it is there.
-      prefix: where the config stands, for messages.
-    Raises: ValueError naming a key that does not exist, and the one that is most like it; or key, value and what is
-      allowed.
+      default: an instance with the values that `values` does not contain.
+      prefix: key of the config, for messages.
+    Raises: ValueError with an unknown key and the most similar key, or with key, value and allowed values.
     """
     try:
         return _built(default, values, prefix)
@@ -173,11 +172,11 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
 
 
 class _NoSuchKey(Exception):
-    """With the whole key, and the names that there are in its place."""
+    """Unknown key, with the whole key and the known names."""
 
 
 def _keys(config: Any, prefix: str) -> Iterator[str]:
-    """Every key below a config dataclass, whole."""
+    """List every key below a config dataclass, in full."""
     for f in fields(config):
         key, value = f"{prefix}.{f.name}" if prefix else f.name, getattr(config, f.name)
         yield key
@@ -186,7 +185,7 @@ def _keys(config: Any, prefix: str) -> Iterator[str]:
 
 
 def _meant(name: str, config: Any, prefix: str) -> str:
-    """Suggest the key of the whole tree that is most like a name, as the end of a sentence; "" if none is."""
+    """Suggest the most similar key of the whole tree, as the end of a sentence; "" if there is none."""
     keys: dict[str, str] = {}
     for key in sorted(_keys(config, prefix), key=lambda key: key.count(".")):
         last = key.rpartition(".")[2]
@@ -233,7 +232,7 @@ def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> 
     if origin in (tuple, list):
         require(isinstance(given, list | tuple), key, given, "a list, as [1,2]")
         of = inner[0] if inner else Any
-        return origin(  # a matrix may be given row by row
+        return origin(  # a matrix, row by row
             _converted(v, hint if of is float and isinstance(v, list | tuple) else of, None, f"{key}[{i}]", said)
             for i, v in enumerate(given)
         )

@@ -20,23 +20,22 @@ __all__ = ["STREAMS", "DQNAgent"]
 STREAMS = ("init", "explore", "replay", "hindsight")
 """Names of the random streams an agent needs, each independent of the others."""
 
-DIAGNOSED = 100  # updates between two looks at the loss and the range of Q
+DIAGNOSED = 100  # updates between two diagnoses of the loss and the range of Q
 
 
 class DQNAgent:
-    """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
+    """Deep Q-learning (Mnih 2015) of S independent agents.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
     mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. The updates of
     one step draw from the same memory, and between two copies the target network stays, so their minibatches and
-    targets are made in one go. Keys of the
-    config change three of these: `hindsight_share` the minibatch, `action_gap` and `value_root` the target y, `huber`
-    the loss.
+    targets are computed together. `hindsight_share` changes the minibatch, `action_gap` and `value_root` the target y,
+    `huber` the loss.
 
     Args:
       config: hyper-parameters. observations: O, numbers per observation. actions: A.
       streams: for each name in STREAMS one SeedSequence per agent.
-      relabel: goal replacement, used on a share `config.hindsight_share` of each minibatch.
+      relabel: goal replacement for a fraction `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
     """
 
@@ -104,9 +103,9 @@ class DQNAgent:
     def observe(
         self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array, ended: Array | None = None
     ) -> None:
-        """Remember one step of every agent (arguments as `Replay.add`) and do the updates that are due.
+        """Store one step of every agent (arguments as `Replay.add`) and do the due updates.
 
-        Args: ended: not needed, a replayed transition stands alone.
+        Args: ended: not used, because transitions are replayed separately.
         """
         self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
@@ -120,7 +119,7 @@ class DQNAgent:
         return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, self._relabel.numbers))
 
     def _minibatches(self, most: int) -> Transition:
-        """Draw n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with another goal.
+        """Draw n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with a new goal.
 
         Their observations are the network's features already, (S, n, B, F): the map is the same for every update.
         """
@@ -153,7 +152,7 @@ class DQNAgent:
         return target
 
     def learn(self, updates: int = 1) -> None:
-        """So many updates of every agent, in several goes where the target network is copied between two of them."""
+        """Run `updates` gradient steps, split at each copy of the target network."""
         while updates:
             due = self.config.target_period - self.updates % self.config.target_period
             batch = self._minibatches(min(updates, due))
@@ -163,7 +162,7 @@ class DQNAgent:
             updates -= target.shape[1]
 
     def fit(self, features: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
-        """One Adam step towards Q(features, action) = target; then, where due, the copy and a look at the loss.
+        """Take one Adam step towards Q(features, action) = target, then copy and diagnose if due.
 
         Args: features: of the observations, (S, B, F). action: (S, B) int64. target: (S, B).
         """
@@ -180,7 +179,7 @@ class DQNAgent:
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def curves(self) -> dict[str, NDArray[np.float64] | float]:
-        """Exploration rate, and loss and range of Q of the last update at which they were looked at."""
+        """Return the exploration rate, and loss and range of Q of the last diagnosed update."""
         q_range = self.q_range.cpu().numpy().astype(np.float64)
         return {
             "train/loss": self.loss.cpu().numpy().astype(np.float64),
@@ -197,7 +196,7 @@ class DQNAgent:
         return {**{name: tensor.cpu() for name, tensor in tensors.items()}, **parts, **counts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
+        """Restore a saved state. Raises: RuntimeError from torch if shapes differ."""
         self.network.flat.copy_(state["online"])
         self.target.flat.copy_(state["target"])
         for name, part in self._parts.items():

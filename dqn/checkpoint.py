@@ -12,13 +12,13 @@ FORMAT = 5
 
 
 class CheckpointError(Exception):
-    """A checkpoint cannot be used; the message says which and why."""
+    """Error of an unusable checkpoint; the message has file and reason."""
 
 
 def save(path: Path, state: dict[str, Any]) -> None:
-    """Write tensors and plain Python values so that `path` is always a whole checkpoint, also after kill -9.
+    """Write tensors and plain Python values atomically: `path` is always complete, also after kill -9.
 
-    Raises: OSError where the disk refuses; the previous checkpoint stays.
+    Raises: OSError if the disk fails; the previous checkpoint stays.
     """
     temporary = path.with_suffix(path.suffix + ".part")
     with open(temporary, "wb") as f:
@@ -36,7 +36,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
 def load(path: Path) -> dict[str, Any]:
     """Read a checkpoint; only tensors and plain values are accepted.
 
-    Raises: CheckpointError naming the file and the remedy.
+    Raises: CheckpointError with file and remedy.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -44,7 +44,7 @@ def load(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: no such checkpoint; the run ended before its first one, start it anew"
         ) from None
-    except Exception as error:  # torch raises whatever its unpickler meets
+    except Exception as error:  # torch's unpickler raises various errors
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({reason}); use one written by this project"

@@ -9,56 +9,56 @@ __all__ = ["DQNConfig"]
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """Everything that shapes learning; the defaults are a plain DQN, and conf/agent/*.yaml give values and reasons.
+    """All settings of learning; the defaults are a plain DQN, conf/agent/*.yaml have other values and reasons.
 
     Steps are control steps of one environment; updates are gradient steps.
-    Raises: ValueError naming key, value and allowed range.
+    Raises: ValueError with key, value and allowed range.
     """
 
-    kind: str = setting("dqn", "which algorithm")
-    hidden: tuple[int, ...] = setting((64, 64), "of the ReLU layers", "units", at_least=1, some=True)
-    gamma: float = setting(0.99, "discount per step", at_least=0.0, below=1.0)
-    learning_rate: float = setting(1e-3, "Adam's", above=0.0, at_most=1.0)
+    kind: str = setting("dqn", "algorithm")
+    hidden: tuple[int, ...] = setting((64, 64), "widths of the ReLU layers", "units", at_least=1, some=True)
+    gamma: float = setting(0.99, "discount factor per step", at_least=0.0, below=1.0)
+    learning_rate: float = setting(1e-3, "learning rate of Adam", above=0.0, at_most=1.0)
     learning_rate_end: float | None = setting(
-        None, "falls to this in the second half of the updates, geometrically; null: stays", above=0.0, at_most=1.0
+        None, "final rate, reached in the second half of the updates; null: constant", above=0.0, at_most=1.0
     )
     total_steps: int = setting(10_000, "length of training", "steps", at_least=1)
     epsilon_start: float = setting(1.0, "exploration rate at step 0", within=(0, 1))
-    epsilon_end: float = setting(0.05, "and from step epsilon_steps on", within=(0, 1))
-    epsilon_steps: int = setting(5_000, "over which it falls linearly", "steps", at_least=0)
-    replay_size: int = setting(10_000, "kept", "transitions", at_least=1)
+    epsilon_end: float = setting(0.05, "exploration rate from step epsilon_steps on", within=(0, 1))
+    epsilon_steps: int = setting(5_000, "steps over which the exploration rate falls linearly", "steps", at_least=0)
+    replay_size: int = setting(10_000, "size of the replay memory", "transitions", at_least=1)
     learn_start: int = setting(
-        500, "before the first update", "steps", at_least=1, note="there must be something to replay"
+        500, "steps before the first update", "steps", at_least=1, note="there must be something to replay"
     )
-    batch_size: int = setting(64, "of a minibatch", "transitions", at_least=1)
+    batch_size: int = setting(64, "transitions in a minibatch", "transitions", at_least=1)
     updates_per_step: int = setting(1, "gradient steps per control step", "updates", at_least=1)
     target_period: int = setting(
-        500, "between copies of the online network to the target network", "updates", at_least=1
+        500, "updates between copies of the online network to the target network", "updates", at_least=1
     )
     action_gap: float = setting(
         0.0,
-        "alpha of advantage learning, which makes action gaps 1 / (1 - alpha) times as wide",
+        "alpha of advantage learning; widens the gaps between actions by 1 / (1 - alpha)",
         at_least=0.0,
         below=1.0,
     )
     output_basis_decay: float = setting(
-        0.0, "rows of the output basis fall as (1 + degree)^-decay; 0: no basis", at_least=0.0
+        0.0, "decay of the output basis, whose rows scale as (1 + degree)^-decay; 0: no basis", at_least=0.0
     )
-    huber: float = setting(0.0, "TD errors beyond this are clipped in the gradient; 0: squared error", at_least=0.0)
+    huber: float = setting(0.0, "TD error above which the gradient is clipped; 0: squared error", at_least=0.0)
     value_root: float = setting(
         0.0,
-        "c of h(z) = c - sqrt(c^2 - z), the scale in which values z of costs are learned; 0: values themselves",
+        "c of h(z) = c - sqrt(c^2 - z), the scale on which the network learns values z; 0: values themselves",
         at_least=0.0,
     )
-    reward_scale: float = setting(1.0, "rewards are multiplied by this inside the agent", above=0.0)
-    hindsight_share: float = setting(0.0, "share of each minibatch that is given another goal", within=(0, 1))
-    hindsight_near: float = setting(0.0, "share of those whose new goal lies close to the state reached", within=(0, 1))
+    reward_scale: float = setting(1.0, "factor of the rewards inside the agent", above=0.0)
+    hindsight_share: float = setting(0.0, "fraction of each minibatch that gets another goal", within=(0, 1))
+    hindsight_near: float = setting(0.0, "fraction of these with a goal close to the reached state", within=(0, 1))
     hindsight_width: tuple[float, float] = setting(
         (1e-3, 0.8), "range of that distance, drawn log-uniformly", "OD", above=0.0, interval=True
     )
-    input_matrix: tuple[float, ...] = setting((), "features = M observation + c, M row by row; []: identity")
+    input_matrix: tuple[float, ...] = setting((), "M of the features M observation + c, row by row; []: identity")
     input_offset: tuple[float, ...] = setting((), "c, one number per feature")
-    init_zero_output: bool = setting(False, "the last layer starts at zero")
+    init_zero_output: bool = setting(False, "start the last layer at zero")
 
     def __post_init__(self) -> None:
         check(self, "agent")

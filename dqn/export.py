@@ -1,4 +1,4 @@
-"""From the weights of one torch agent to `dqn.policy.Policy`."""
+"""Conversion of one torch agent's weights to `dqn.policy.Policy`."""
 
 from typing import Any
 
@@ -23,10 +23,10 @@ def export(
     """Export the greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
 
     Args:
-      network: gives layer sizes and input map. agent: index into `flat`.
-      flat: weights of all agents, shape (S, P); not necessarily the network's own (the best ones, say).
+      network: source of layer sizes and input map. agent: index into `flat`.
+      flat: weights of all agents, shape (S, P); e.g. the best ones, not those of `network`.
       actions: the action grid, shape (A,). limits: of the observation, low and high, each (O,).
-      metadata: observation, model, config_hash and whatever else a bench should check or show.
+      metadata: observation, model, config_hash and other values to check or show.
     """
     own = QNetwork(flat[agent : agent + 1].detach().cpu().clone(), network.sizes)
     weights = [weight[0].numpy().copy() for weight, _ in own.layers]

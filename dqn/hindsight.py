@@ -1,4 +1,4 @@
-"""Hindsight: a replayed transition (x, u, x') does not depend on the goal, so it is as true under any other goal."""
+"""Hindsight: a replayed transition (x, u, x') does not depend on the goal, so it is valid with any goal."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ __all__ = ["GoalRelabel", "ProgramRelabel", "Relabel", "ShiftRelabel"]
 
 
 class Relabel(Protocol):
-    """Another goal for the transitions of a minibatch, in two parts: what needs only random numbers, and the rest.
+    """New goals for the transitions of a minibatch, in two steps; the first needs only random numbers.
 
     numbers: W, uniform numbers per transition.
     """
@@ -24,16 +24,16 @@ class Relabel(Protocol):
         """Turn uniform random numbers into goals, (..., B, W) -> (..., B, any), for many minibatches at once."""
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """Give transitions (..., B) the goals that were drawn, (..., B, any), in place."""
+        """Set the drawn goals, (..., B, any), in transitions (..., B), in place."""
 
 
 class GoalRelabel:
-    """Replaces the goal of transitions, and with it the reward (Andrychowicz 2017); observations are [x, goal].
+    """Replacement of goal and reward of transitions (Andrychowicz 2017); observations are [x, goal].
 
-    Two kinds of goals are drawn. A share `hindsight_near` of each batch gets x' + d or x' - d, log d uniform over the
-    range `hindsight_width`, so that errors of every order of magnitude are trained on equally often. If one side lies
-    outside the range of goals, the other side is taken. The rest of the batch, and transitions for which both sides lie
-    outside, get a goal drawn uniformly from the range of goals.
+    Two kinds of goals are drawn. A fraction `hindsight_near` of each batch gets x' + d or x' - d, log d uniform over
+    the range `hindsight_width`, so that errors of every order of magnitude are trained on equally often. If one side
+    lies outside the range of goals, the other side is taken. The rest of the batch, and transitions for which both
+    sides lie outside, get a goal drawn uniformly from the range of goals.
 
     Args:
       config: its keys `hindsight_*`. goals: lowest and highest goal of the task.
@@ -68,10 +68,10 @@ class GoalRelabel:
 
 
 class ShiftRelabel:
-    """The same where the observation is [error, parameter]: another goal shifts the error before and after alike.
+    """The same for observations [error, parameter]: a new goal shifts the error before and after equally.
 
-    A share `hindsight_near` of each batch is shifted so that the error after the step is d or -d, as above; the rest so
-    that the error before it is uniform within +-span.
+    A fraction `hindsight_near` of each batch is shifted so that the error after the step is d or -d, as above. The
+    others are shifted so that the error before the step is uniform within +-span.
 
     Args: config: its keys `hindsight_*`. span: of errors. reward: of the error reached, any shape.
     """
@@ -97,12 +97,12 @@ class ShiftRelabel:
 
 
 class ProgramRelabel:
-    """The same where the observation is [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
+    """The same for observations [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
 
     x is an integrator: what a step adds to it (or multiplies it by) depends on neither x nor the goals. So x before and
-    after is moved to a place drawn uniformly, and a setpoint is given as above, near the x reached or anywhere. With an
+    after is moved to a uniformly drawn place, and a setpoint is drawn as above, near the reached x or anywhere. With an
     announced change, the next setpoint is drawn anywhere and its time uniformly from the periods of the preview; for a
-    share `unannounced` nothing is announced. After the step the change is a period nearer, or has come.
+    fraction `unannounced` nothing is announced. After the step the change is one period closer, or has happened.
 
     Args:
       config: its keys `hindsight_*`. place: uniform numbers to x. spread: to setpoints as x. reward: (x', setpoint) ->

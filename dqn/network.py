@@ -37,10 +37,10 @@ def action_basis(actions: int, decay: float) -> torch.Tensor:
     """C with Q = z C: row k is the polynomial of degree k in the action, scaled by (1 + k)^-decay.
 
     The polynomials are orthogonal on the A equidistant actions and have mean square 1 there (discrete Legendre or Gram
-    polynomials). C is invertible, so the network can represent the same Q values with it as without. It changes the
-    direction of gradient steps. A step for one action moves Q of similar actions alike, and a difference between
-    actions is learned the more slowly the higher its degree. Q is nearly a parabola in the pump rate, which three rows
-    give exactly. A cosine series would flatten the parabola at the ends of the grid.
+    polynomials). C is invertible, so the network can represent the same Q values. C changes the direction of gradient
+    steps: a step for one action moves Q of similar actions equally, and differences of higher degree between actions
+    are learned more slowly. Q is nearly a parabola in the pump rate, which three rows give exactly. A cosine series
+    would flatten the parabola at the ends of the grid.
 
     Args: actions: A. decay: >= 0.
     Returns: shape (A, A), float32.

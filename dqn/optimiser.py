@@ -11,8 +11,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 class Adam:
     """w <- w - lr m^ / (sqrt(v^) + eps), m and v running means of g and g^2, ^ corrected for their start (Kingma 2015).
 
-    The step is the fused kernel that torch.optim.Adam(fused=True) calls. Torch's class also keeps books on parameter
-    groups and takes six times as long. For one agent, calling the kernel directly saves a tenth of an update.
+    The step is the fused kernel of torch.optim.Adam(fused=True). Torch's class also manages parameter groups and takes
+    six times as long. For one agent, the direct call saves a tenth of an update.
 
     Args:
       weights: changed in place, any shape. gradient: read at each step, same shape.
@@ -24,7 +24,7 @@ class Adam:
         self._steps = torch.zeros((), device=weights.device)
 
     def step(self, learning_rate: float) -> None:
-        """One step along the gradient."""
+        """Take one step along the gradient."""
         self._steps += 1
         torch._fused_adam_(
             [self._weights], [self._gradient], [self._mean], [self._square], [], [self._steps],

@@ -1,4 +1,4 @@
-"""The greedy policy as plain arrays: read from policy.npz and evaluated with NumPy alone, where torch is absent.
+"""The greedy policy as plain arrays, read from policy.npz and evaluated with NumPy, without torch.
 
 Format 2 of policy.npz: arrays `w0, b0, w1, b1, ...` (float32, layer k maps h to relu(h @ wk + bk), the last without
 relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `observation_high` (O,), `actions` (A,), and
@@ -6,8 +6,9 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 
 | observation | what it is | actions |
 |---|---|---|
-| od, setpoint (, next_setpoint, minutes_to_change) | OD x, setpoint r, and the change (envs/preview.py) | mL/s |
-| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | shares of it |
+| od, setpoint (, next_setpoint, minutes_to_change) | OD x, setpoint r, and its change (envs/preview.py) | mL/s |
+| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | fractions of it
+|
 | logit_share, temperature, rate, logit_setpoint (, logit_next, minutes_to_change) | envs/coculture/task.py | degC |
 """
 
@@ -36,15 +37,15 @@ KNOWN = (ABSOLUTE, PREVIEW, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
 
 
 class PolicyError(Exception):
-    """A policy file cannot be used; the message says which, why, and what to do."""
+    """Error of an unusable policy file; the message has file, reason and remedy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """actions[argmax_a Q(M o + c, a)] for an observation o, clipped to the range that was trained.
+    """Policy actions[argmax_a Q(M o + c, a)] of an observation o, clipped to the trained range.
 
     weights, biases: per layer (in, out) and (out,), float32. input_matrix: M (F, O); input_offset: c (F,).
-    actions: (A,), in the unit that belongs to the observation. low, high: limits of the observation, (O,).
+    actions: (A,), in the unit of the observation's task. low, high: limits of the observation, (O,).
     metadata: as in the module's description.
     """
 
@@ -75,12 +76,12 @@ class Policy:
         return np.asarray(self.q_values(observation).argmax(axis=-1))
 
     def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the greedy action itself: a pump rate in mL/s or a share of the largest, (N, O) -> (N,)."""
+        """Return the greedy action itself: a pump rate in mL/s or a fraction of the largest, (N, O) -> (N,)."""
         return self.actions[self.act(observation)]
 
 
 def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
-    """Every array of a policy file but its metadata, by name."""
+    """Return all arrays of a policy file except its metadata, by name."""
     arrays: dict[str, NDArray[Any]] = {
         "input_matrix": policy.input_matrix,
         "input_offset": policy.input_offset,
@@ -94,7 +95,7 @@ def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
 
 
 def fingerprints(policy: Policy) -> dict[str, str]:
-    """SHA-256 of everything that decides which action is chosen and what it means, by name."""
+    """Return the SHA-256 of each array that determines the chosen action or its meaning, by name."""
     said = {key: policy.metadata.get(key) for key in ("observation", "control_min", "model")}
     arrays = _arrays(policy)
     limits = ("observation_low", "observation_high")
@@ -121,7 +122,7 @@ def save(path: Path, policy: Policy) -> None:
 def load(path: Path) -> Policy:
     """Read and check policy.npz.
 
-    Raises: PolicyError naming the file, what is wrong with it and the remedy.
+    Raises: PolicyError with file, reason and remedy.
     """
     remedy = "give the policy.npz of a training run"
     try:
@@ -131,7 +132,7 @@ def load(path: Path) -> Policy:
         raise PolicyError(f"policy {path}: no such file; {remedy}") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if "pickle" in reason:  # NumPy's advice is for files that one trusts
+        if "pickle" in reason:  # NumPy's own message advises to trust the file
             reason = "no NumPy archive"
         raise PolicyError(f"policy {path}: not a policy file ({reason}); {remedy}") from None
     try:

@@ -1,4 +1,4 @@
-"""Any number of agents, trained in groups side by side on the CPU's cores."""
+"""Any number of agents, trained in parallel groups on the CPU's cores."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -17,23 +17,22 @@ GROUP = 16
 
 
 def fast_arithmetic() -> None:
-    """Numbers below 1e-38 count as 0 in this thread, where the processor can do that.
+    """Treat numbers below 1e-38 as 0 in this thread, if the processor supports it.
 
-    A unit that is never on has no gradient. The running mean of an earlier one shrinks by a tenth an update down to
-    1e-45, where rounding keeps it, and a processor is many times slower on such numbers. A step that comes of them is
-    below 1e-30, so that no weight changes.
+    An inactive unit has no gradient. Its running mean shrinks by a tenth per update down to 1e-45, where rounding stops
+    it. A processor is many times slower on such numbers. Their steps are below 1e-30, so no weight changes.
     """
     torch.set_flush_denormal(True)
 
 
 class Population:
-    """S agents in groups that share nothing. Each group has its own copies of the environment, and trains in a thread.
+    """S agents in independent groups. Each group has its own copies of the environment and trains in a thread.
 
-    Torch releases Python's lock during its operations, so two groups on two cores finish in two thirds of the time that
-    they need one after the other. The grouping does not depend on the number of threads, so results do not either.
+    Torch releases Python's lock during its operations, so two groups on two cores need two thirds of the sequential
+    time. The grouping, and so the result, does not depend on the number of threads.
 
     Args:
-      groups: trainers of the same config and interval; the agents of the first come first.
+      groups: trainers of the same config and interval; agents keep this order.
       threads: groups trained at the same time; None means as many as there are cores for this process.
     """
 
@@ -67,7 +66,7 @@ class Population:
         return torch.cat([group.agent.network.flat for group in self.groups])
 
     def run(self) -> Iterator[TrainRecord]:
-        """Train all groups to the end; one record, of all agents, per interval."""
+        """Train all groups to the end; yield one record of all agents per interval."""
         running = [group.run() for group in self.groups]
         with ThreadPoolExecutor(min(self.threads, len(running)), initializer=fast_arithmetic) as pool:
             while True:

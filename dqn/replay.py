@@ -1,4 +1,4 @@
-"""Replay memory: a preallocated ring of transitions for S agents that step together."""
+"""Replay memory: a preallocated ring buffer of transitions for S agents that step together."""
 
 from typing import Any, NamedTuple
 
@@ -15,8 +15,8 @@ Array = NDArray[Any]
 class Transition(NamedTuple):
     """Minibatches of B steps of each of S agents: observation before, action, reward, observation after.
 
-    s_tm1, s_t: (S, ..., B, O) float32. a_tm1: (S, ..., B) int64. r_t: (S, ..., B) float32. One minibatch has no axis
-    more, several have one.
+    s_tm1, s_t: (S, ..., B, O) float32. a_tm1: (S, ..., B) int64. r_t: (S, ..., B) float32. Several minibatches have one
+    axis more than a single one.
     continues: (S, ..., B) float32, 0 where the episode terminated (no bootstrapping), 1 also where it was truncated.
     """
 
@@ -30,8 +30,7 @@ class Transition(NamedTuple):
 class Replay:
     """The last `capacity` transitions of each of S agents.
 
-    A transition is one row of 2 O + 3 float32 numbers, so that remembering one is one copy and drawing minibatches one
-    gather.
+    A transition is one row of 2 O + 3 float32 numbers: storing it is one copy, drawing minibatches is one gather.
 
     Args: agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
     """
@@ -52,7 +51,7 @@ class Replay:
         return min(self.added, self.capacity)
 
     def add(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
-        """Append one transition per agent, replacing the oldest when full.
+        """Append one transition per agent; when full, replace the oldest.
 
         Args: as the fields of `Transition`, as NumPy arrays without the axis B.
         """
@@ -66,9 +65,9 @@ class Replay:
         self.added += 1
 
     def sample(self, uniform: Array) -> Transition:
-        """Uniform draws with replacement.
+        """Draw transitions uniformly with replacement.
 
-        Args: uniform: float64 in [0, 1), shape (S, ..., B); number v picks row floor(v * size).
+        Args: uniform: float64 in [0, 1), shape (S, ..., B); number v selects row floor(v * size).
         Returns: minibatches, copies. Raises: ValueError while the memory is empty.
         """
         if self.added == 0:

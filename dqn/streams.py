@@ -1,4 +1,4 @@
-"""Random numbers for a population: agent i draws the same ones whether it is trained alone or among others."""
+"""Random numbers for a population: agent i draws the same numbers alone or in a population."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,14 +14,14 @@ CALLS_PER_BLOCK = 128
 class UniformStream:
     """Uniform numbers in [0, 1), `width` per agent and call, each agent from a generator of its own.
 
-    Each generator draws the numbers of CALLS_PER_BLOCK calls at once, a block, so that most calls need no Python loop
-    over agents, and what follows from the numbers alone is computed once a block. What is saved is the place in the
-    block and the generators as they were before they drew it, from which the block is drawn again. Once the block is
-    used up, the generators are saved as they are.
+    Each generator draws the numbers of CALLS_PER_BLOCK calls at once, a block, so most calls need no Python loop over
+    agents, and values that depend only on the numbers are computed once per block. The saved state is the position in
+    the block and the generators before that block, from which the block is drawn again. After the end of the block the
+    current generators are saved.
 
     Args:
       seeds: one per agent, S. width: numbers per agent and call.
-      into: what becomes of a block, float64 (S, calls, width) -> an array or tensor (S, calls, ...).
+      into: conversion of a block, float64 (S, calls, width) -> an array or tensor (S, calls, ...).
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class UniformStream:
         self._position = 0
 
     def take(self, calls: int) -> Any:
-        """Take the numbers of the next n calls, (S, n, ...), n = `calls` or as many as are left in the block."""
+        """Take the numbers of the next n calls, (S, n, ...), n = `calls` or the remaining calls of the block."""
         if self._position == CALLS_PER_BLOCK:
             self._refill()
         start, self._position = self._position, min(self._position + calls, CALLS_PER_BLOCK)

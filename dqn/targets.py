@@ -15,17 +15,17 @@ def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torc
 
 
 def compressed(value: torch.Tensor, root: float) -> torch.Tensor:
-    """h(z) = c - sqrt(c^2 - z) of values z <= 0, any shape: the scale in which costs are learned (after Pohlen 2018).
+    """Return h(z) = c - sqrt(c^2 - z) of values z <= 0, any shape: the scale of learned costs (after Pohlen 2018).
 
-    Costs are squared errors, so that values span many orders of magnitude: those of a culture at its setpoint vanish
-    beside those of one far away. Their root is of the size of the error itself. Where nothing is random, the fixed
-    point of h(r + gamma max h^-1(Q)) is h(Q*), with the same greedy policy. Args: root: c > 0, below which h is linear.
+    Costs are squared errors, so values span many orders of magnitude. Their root is of the size of the error itself. In
+    a deterministic task the fixed point of h(r + gamma max h^-1(Q)) is h(Q*), with the same greedy policy. Args: root:
+    c > 0, below which h is linear.
     """
     return root - torch.sqrt(root * root - value.clamp(max=0.0))
 
 
 def expanded(q: torch.Tensor, root: float) -> torch.Tensor:
-    """h^-1(q) = c^2 - (c - q)^2, any shape; what lies above 0, which no cost does, counts as 0."""
+    """Return h^-1(q) = c^2 - (c - q)^2, any shape, limited to at most 0, since no cost is negative."""
     return root * root - torch.square(root - q.clamp(max=0.0))
 
 
@@ -33,7 +33,7 @@ def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_
     """Compute y - alpha (max_a Q_target(s, a) - Q_target(s, a_tm1)): advantage learning (Baird 1999).
 
     The fixed point has the same greedy policy and the same maximum V; its gaps V - Q(s, a) are 1 / (1 - alpha) times
-    those of Q-learning, so that an error of the network confuses fewer actions (Bellemare 2016, eq. 10).
+    those of Q-learning, so an error of the network affects the order of fewer actions (Bellemare 2016, eq. 10).
 
     Args: target: y, (S, B); q_tm1: target network at s, (S, B, A); a_tm1: (S, B) int64.
     Returns: shape (S, B).

@@ -1,4 +1,4 @@
-"""The loop of agent and environment as a generator; counting, logging, evaluating and stopping belong to the caller."""
+"""The loop of agent and environment as a generator; the caller counts, logs, evaluates and stops."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class TrainingEnv(Protocol):
 
 
 class Agent(Protocol):
-    """S agents that learn side by side, each in its own copy of the environment; `DQNAgent` is one kind.
+    """S agents that learn in parallel, each in its own copy of the environment; `DQNAgent` is one kind.
 
-    config: with `kind` and `total_steps`. network: of all agents; the action with its largest output is the greedy
-    policy, which is scored, kept and exported. steps: of the environment so far. updates: gradient steps so far.
+    config: with `kind` and `total_steps`. network: of all agents; its largest output is the greedy action. The greedy
+    policy is scored, kept and exported. steps: of the environment so far. updates: gradient steps so far.
     """
 
     config: Any
@@ -52,7 +52,7 @@ class Agent(Protocol):
     updates: int
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Choose actions to learn from, (S, O) -> (S,)."""
+        """Choose exploratory actions, (S, O) -> (S,)."""
 
     def observe(
         self,
@@ -63,17 +63,17 @@ class Agent(Protocol):
         continues: NDArray[np.bool_],
         ended: NDArray[np.bool_],
     ) -> None:
-        """Count one step of every agent and learn from it.
+        """Process one step of every agent and learn from it.
 
-        Args: s_tm1, s_t: before and after it, (S, O). continues: there is a future to value, (S,). ended: the next step
-          begins another episode, (S,); both hold where an episode was cut off at its last step.
+        Args: s_tm1, s_t: before and after it, (S, O). continues: bootstrap from s_t, (S,). ended: the next step begins
+        a new episode, (S,). Both are true at the last step of a truncated episode.
         """
 
     def curves(self) -> Curves:
-        """Return what to log, by tag: one number per agent, (S,), or one for all."""
+        """Return the values to log, by tag: one number per agent, (S,), or one for all."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return tensors and plain values, with which a new agent of the same config continues to the bit."""
+        """Return tensors and plain values from which a new agent of the same config continues to the bit."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved."""
@@ -81,9 +81,9 @@ class Agent(Protocol):
 
 @dataclass(frozen=True)
 class TrainRecord:
-    """What happened in one interval of training; arrays have one entry per agent, shape (S,).
+    """Record of one interval of training; arrays have one entry per agent, shape (S,).
 
-    episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
+    episode_return: undiscounted reward of the last episode that ended in the interval, else nan.
     curves: of `Agent.curves`, by tag.
     """
 
@@ -94,7 +94,7 @@ class TrainRecord:
 
     @classmethod
     def joined(cls, records: Sequence[TrainRecord]) -> TrainRecord:
-        """One record of the agents of several, taken at the same step."""
+        """Join records of the same step into one record of all agents."""
         curves = {
             tag: np.concatenate([np.asarray(r.curves[tag]) for r in records]) if np.ndim(first) else first
             for tag, first in records[0].curves.items()
@@ -103,7 +103,7 @@ class TrainRecord:
 
 
 class Trainer:
-    """Lets S agents act in S copies of the environment and learn.
+    """Loop in which S agents act in S copies of the environment and learn.
 
     Args: env: one copy per agent. agent: the S agents. interval: steps between records.
     """
@@ -124,17 +124,17 @@ class Trainer:
         while self.agent.steps < total:
             self._until(min(total, self.agent.steps - self.agent.steps % self.interval + self.interval))
             record = self._record()
-            self._finished[:] = np.nan  # whoever saves at a record saves none of its returns
+            self._finished[:] = np.nan  # a state saved at a record must not contain its returns
             yield record
 
-    @torch.inference_mode()  # gradients are written out by hand: torch need not be ready for any
+    @torch.inference_mode()  # gradients are computed by hand, so torch needs no graph
     def _until(self, step: int) -> None:
-        """Train until so many environment steps are done."""
+        """Train up to an environment step."""
         while self.agent.steps < step:
             self._step()
 
     def _step(self) -> None:
-        """One environment step of every agent, and its updates."""
+        """Run one environment step of every agent and the due updates."""
         assert self._observation is not None
         agent = self.agent
         before = self._observation
@@ -142,7 +142,7 @@ class Trainer:
         self._observation, reward, terminated, truncated, infos = self.env.step(action)
         done = terminated | truncated
         ended = done.any()
-        # at the end of an episode the environment already shows the start of the next one
+        # at the end of an episode the environment returns the first observation of the next one
         reached = np.where(done[:, None], infos["final_obs"], self._observation) if ended else self._observation
         agent.observe(before, action, reward, reached, ~terminated, done)
         self._return += reward

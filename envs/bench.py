@@ -1,4 +1,4 @@
-"""What everybody has to know alike of a bench: the culture's volume, the period of its doses, the pump's cap."""
+"""Bench values that all parts of the program share: culture volume, control period, largest pump rate."""
 
 import math
 from collections.abc import Sequence
@@ -12,29 +12,29 @@ from conf.schema import check, require, setting
 __all__ = ["VIAL_ML", "Bench"]
 
 VIAL_ML = 30.0
-"""What the vial of a Chi.Bio holds up to its rim, mL (docs/biology.md, Volume)."""
+"""Volume of a Chi.Bio vial up to its rim, mL (docs/biology.md, Volume)."""
 
 WITHIN_ML = (5.0, 38.0)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Said once and read by interlock, driver, estimators, laws, certificate, timetable and simulated vials.
+    """Bench values for interlock, driver, estimators, controllers, certificate, timetable and simulated vials.
 
-    How fast a reactor is fed is asked in mL/s over a control period; what flows at once is the driver's matter.
+    A pump rate in mL/s is a mean over a control period; the driver chooses the actual flow.
 
-    Raises: ValueError naming key, value and allowed range.
+    Raises: ValueError with key, value and allowed range.
     """
 
-    volume_ml: float = setting(20.0, "culture up to the waste tube", "mL", within=WITHIN_ML)
+    volume_ml: float = setting(20.0, "culture volume up to the waste tube", "mL", within=WITHIN_ML)
     volumes_ml: dict[str, float] = setting(
-        {}, "of single reactors whose tube ends elsewhere, e.g. bench.volumes_ml.M1=14", "mL"
+        {}, "volume of single reactors that differ, e.g. bench.volumes_ml.M1=14", "mL"
     )
-    period_s: float = setting(60.0, "control period: from a sample and its dose to the next", "s", within=(1, 3600))
+    period_s: float = setting(60.0, "control period: from one sample and its dose to the next", "s", within=(1, 3600))
     max_rate: float = setting(
-        0.02, "largest feed rate; the Chi.Bio's own regulator has this cap", "mL/s", above=0.0, at_most=0.05
+        0.02, "largest pump rate; the Chi.Bio's own regulator has this limit", "mL/s", above=0.0, at_most=0.05
     )
-    bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
+    bottle_ml: float = setting(2000.0, "fresh medium per reactor at the start", "mL", above=0.0, below=math.inf)
 
     def __post_init__(self) -> None:
         check(self, "bench")
@@ -49,7 +49,7 @@ class Bench:
 
     @property
     def stale_s(self) -> float:
-        """Age at which a newest sample is no basis for a dose, s: the next one is late by 40 s, or a tenth more."""
+        """Age at which the newest sample is too old for a dose, s: a period and 40 s, or a tenth more."""
         return max(self.period_s + 40.0, 1.1 * self.period_s)
 
     @property

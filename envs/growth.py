@@ -1,4 +1,4 @@
-"""How bacteria grow and are diluted: growth laws, temperature responses and the mass balances of one vial.
+"""Growth and dilution of bacteria: growth laws, temperature responses and the mass balances of one vial.
 
 Everything takes a leading axis of N vials; one vial is N = 1. Units: min, 1/min, mL/s (pump rate), degC; OD has none.
 """
@@ -17,7 +17,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-REFERENCE_TEMPERATURE = 37.0  # degC at which every rate below is quoted
+REFERENCE_TEMPERATURE = 37.0  # reference temperature of every rate below, degC
 GAS_CONSTANT = 8.314462618e-3  # kJ/(mol K)
 
 
@@ -28,7 +28,7 @@ class GrowthLaw(Protocol):
         """Compute mu in 1/min, shape (N,).
 
         Args: substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
-        Raises: nothing; parameters are checked where they are set, so the hot path stays bare.
+        Raises: nothing; parameters are checked where they are set.
         """
 
 
@@ -42,7 +42,7 @@ class Exponential:
     mu: float | Array
 
     def specific_rate(self, substrate: Array) -> Array:
-        """mu, whatever the substrate is; see `GrowthLaw.specific_rate`."""
+        """Return mu for any substrate; see `GrowthLaw.specific_rate`."""
         return np.broadcast_to(np.asarray(self.mu, dtype=np.float64), substrate.shape)
 
 
@@ -101,7 +101,7 @@ class Cardinal:
 
 
 def relative_to_37(response: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """phi(T) / phi(37 degC): a response by which a rate quoted at 37 degC may be multiplied."""
+    """Return phi(T) / phi(37 degC), the factor of a rate that is given for 37 degC."""
     reference = response(np.asarray(REFERENCE_TEMPERATURE))
     return lambda temperature: response(temperature) / reference
 
@@ -119,7 +119,7 @@ class DilutedCulture:
     Args:
       law: specific growth rate.
       tau: u/tau is the dilution rate in 1/min for u in mL/s; tau = volume_ml / 60 for a true flow. Scalar or (N,), > 0.
-      yield_od: OD grown from one fill of fresh medium; inf means that substrate never runs out. Scalar or (N,), > 0.
+      yield_od: OD produced by one fill of fresh medium; inf: substrate never runs out. Scalar or (N,), > 0.
     """
 
     law: GrowthLaw

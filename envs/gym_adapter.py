@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv, checked_actions
+from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv
 
 __all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 
@@ -22,11 +22,11 @@ REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
 
 
 class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
-    """A vector environment with N = 1 and no autoreset; observation, action and reward are specified there.
+    """A vector environment with N = 1 and without autoreset; that class specifies observation, action and reward.
 
-    Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw; `render` says so.
+    Args: config: the task; overrides: values of it. render_mode: None; there is no drawing.
     `info` holds the observation's numbers by name in full precision, as far as the model knows them: {"od": ...}.
-    Raises: ValueError naming what is not allowed; TypeError for a `render_mode`.
+    Raises: ValueError with the invalid value; TypeError for a `render_mode`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
@@ -38,14 +38,14 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         self.config = self._batch.config
         self.observation_space = self._batch.single_observation_space
         self.action_space = self._batch.single_action_space
-        self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
+        self._next: NDArray[np.float32] | None = None  # start of the episode that the batch has already begun
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; with a seed the same one every time. Args: options: as of the vector environment.
+        """Start an episode; a seed makes it reproducible. Args: options: as of the vector environment.
 
-        Raises: ValueError naming an option that there is not, or a value out of range.
+        Raises: ValueError with an unknown option, or a value out of range.
         """
         super().reset(seed=seed)
         if seed is not None or self._next is None or options:
@@ -56,13 +56,13 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     def _info(self) -> dict[str, Any]:
         return dict(zip(self._batch.names, self._batch.state[0].tolist(), strict=False))
 
-    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Advance one control period; `truncated` after `episode_steps`, then `reset` must follow.
 
-        Raises: ValueError for an action outside the grid, or that is not one integer; RuntimeError before a reset.
+        Raises: ValueError for an action that is not a single index of the grid; RuntimeError before a reset.
         """
-        index = checked_actions(action, (), self.config.n_actions)
-        observation, reward, _, truncated, infos = self._batch.step(index[None])
+        index = self._batch.checked(action, ())
+        observation, reward, _, truncated, infos = self._batch.step(index.reshape(self._batch.action_space.shape))
         info = self._info()
         if truncated[0]:
             self._next, observation = observation[0], infos["final_obs"]

@@ -13,7 +13,7 @@ Integrator = Callable[[Derivative, Array, float, int], Array]
 
 
 def euler(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
-    """Explicit Euler, y <- y + h f(y), first order; with h = 0.1 min what the paper integrates its model by.
+    """Integrate by explicit Euler, y <- y + h f(y), first order; the paper uses h = 0.1 min.
 
     Args:
       f: derivative, maps y to y' of the same shape. y: start value, any shape.
@@ -28,7 +28,7 @@ def euler(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
 
 
 def rk4(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
-    """Classical Runge-Kutta, fourth order; arguments as `euler`."""
+    """Integrate by classical Runge-Kutta, fourth order; arguments as `euler`."""
     h = duration / substeps
     for _ in range(substeps):
         k1 = f(y)

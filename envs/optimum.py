@@ -1,11 +1,11 @@
-"""The best possible controllers of the training model, by dynamic programming: the yardstick of every learned one.
+"""Optimal controllers of the training model by dynamic programming, the reference for every learned policy.
 
 On a fine grid of log x an action is a shift by log f_a, and V is linear between grid points. Two problems are solved:
 
-- `solve_episode`: the one that is scored, V_k(x) = min_a [(f_a x - s)^2 + V_{k-1}(f_a x)] with V_0 = 0, the least sum
-  of squared errors over the k steps that are left. Backward induction (Bellman 1957), k sweeps over the grid.
+- `solve_episode`: the scored problem, V_k(x) = min_a [(f_a x - s)^2 + V_{k-1}(f_a x)] with V_0 = 0, the least sum of
+squared errors over the remaining k steps. Backward induction (Bellman 1957), k sweeps over the grid.
 - `solve`: the discounted problem without an end, V(x) = min_a [(f_a x - s)^2 + gamma V(f_a x)], whose values a network
-  learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
+learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
 __all__ = ["EpisodeOptimum", "OptimalPolicy", "RelativeOptimum", "solve", "solve_episode", "solve_relative"]
 
 Array = NDArray[np.float64]
-SPACING = 4.7e-4  # of log OD: eight points to one of the nominal model's 17 actions
+SPACING = 4.7e-4  # of log OD: eight points per action of the nominal model
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeOptimum:
-    """The best controller of setpoints that are known ahead, for as many steps.
+    """Optimal controller of setpoints that are known ahead, for as many steps.
 
     setpoint: s of each step, OD, shape (K,). log_od: uniform grid of log OD, shape (G,).
     factors: x(t+1) = factors[a] x(t), shape (A,).
@@ -39,13 +39,13 @@ class EpisodeOptimum:
     value: Array
 
     def act(self, od: Array, left: int) -> NDArray[np.intp]:
-        """Index of the best action with `left` steps to go, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
+        """Return the best action with `left` remaining steps, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
         after = np.minimum(np.maximum(od, 1e-6)[:, None] * self.factors, MAX_OD)
         ahead = np.interp(np.log(np.maximum(after, 1e-12)), self.log_od, self.value[left - 1])
         return np.asarray(np.argmin((after - self.setpoint[-left]) ** 2 + ahead, axis=1), dtype=np.intp)
 
     def rollout(self, od: Array) -> tuple[Array, NDArray[np.intp]]:
-        """K steps from the starts `od`, shape (N,): the OD after each step and the action taken, each (K, N)."""
+        """Run K steps from the starts `od`, shape (N,); return the OD after each step and the action, each (K, N)."""
         steps = self.value.shape[0] - 1
         ods, actions = np.empty((steps, od.size)), np.empty((steps, od.size), dtype=np.intp)
         for k in range(steps):
@@ -57,8 +57,8 @@ class EpisodeOptimum:
 def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = SPACING) -> EpisodeOptimum:
     """Solve an episode for its least undiscounted cost.
 
-    Args: config: the task; its actions and its integrator are used as they are. setpoint: OD, of all
-      `config.episode_steps` steps or of each of them, (K,). spacing: of log OD.
+    Args: config: the task; with its actions and integrator. setpoint: OD, of all `config.episode_steps` steps or of
+      each of them, (K,). spacing: of log OD.
     """
     factors, program = step_factors(config), np.broadcast_to(setpoint, config.episode_steps)
     log_od = _reach(config, program, factors, spacing)
@@ -70,14 +70,14 @@ def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = S
 def _backward(stages: Sequence[Array], shift: Array) -> Array:
     """V_k = min_a [stage_k,a + V_{k-1} moved by shift_a], V_0 = 0, shape (K + 1, G).
 
-    Args: stages: cost of each step from each grid point, the last step first, each (A, G). shift: what an action
-      moves, in grid points, (A,).
+    Args: stages: cost of each step from each grid point, the last step first, each (A, G). shift: of each action, in
+      grid points, (A,).
     """
     points = stages[0].shape[1]
     whole = np.floor(shift)
     part = (shift - whole)[:, None]
     whole = np.clip(whole, -points, points).astype(np.intp)
-    pad = int(np.abs(whole).max()) + 1  # beyond its ends V is constant
+    pad = int(np.abs(whole).max()) + 1  # V is constant beyond the grid
     value = np.zeros((len(stages) + 1, points))
     for (before, now), stage in zip(pairwise(value), stages, strict=True):
         ahead = np.pad(before, pad, mode="edge")
@@ -90,7 +90,7 @@ def _backward(stages: Sequence[Array], shift: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RelativeOptimum:
-    """The best controller of e' = e + s - v (`envs/relative.py`) at one growth share for a known number of steps.
+    """Optimal controller of e' = e + s - v (`envs/relative.py`) at one growth share for a known number of steps.
 
     growth_share: s. error: uniform grid of e, (G,). levels: v, (A,). value: V_k, least sum of e^2, (K + 1, G).
     """
@@ -101,12 +101,12 @@ class RelativeOptimum:
     value: Array
 
     def act(self, error: Array, left: int) -> NDArray[np.intp]:
-        """Index of the best action with `left` steps to go, by one exact look-ahead; (N,) -> (N,)."""
+        """Return the best action with `left` remaining steps, by one exact look-ahead; (N,) -> (N,)."""
         after = error[:, None] + self.growth_share - self.levels
         return np.asarray(np.argmin(after**2 + np.interp(after, self.error, self.value[left - 1]), axis=1))
 
     def rollout(self, error: Array) -> tuple[Array, NDArray[np.intp]]:
-        """K steps from the starts, shape (N,): the error after each step and the action taken, each (K, N)."""
+        """Run K steps from the starts, shape (N,); return the error after each step and the action, each (K, N)."""
         steps = self.value.shape[0] - 1
         errors, actions = np.empty((steps, error.size)), np.empty((steps, error.size), dtype=np.intp)
         for k in range(steps):
@@ -128,9 +128,9 @@ def solve_relative(
 
 
 def _reach(config: EnvConfig, program: Array, factors: Array, spacing: float) -> Array:
-    """Grid of log OD, shape (G,), that holds what an optimal episode can reach from the starts that are scored.
+    """Return a grid of log OD, shape (G,), that covers every optimal episode from the scored starts.
 
-    A culture that outgrows the pump's largest rate keeps growing, up to the cap of the environment.
+    A culture that grows faster than the largest rate dilutes keeps growing, up to the limit of the environment.
     """
     low = min(config.start_od[0], SCORED_OD[0], program.min()) * 0.8
     outgrown = config.episode_steps * max(0.0, np.log(np.maximum(factors, 1e-12)).min())
@@ -155,7 +155,7 @@ class OptimalPolicy:
     gamma: float
 
     def cost_to_go(self, od: Array, row: NDArray[np.intp]) -> Array:
-        """V(od) of the setpoint with index `row`; `od` and `row` broadcast to one shape, which is returned."""
+        """Return V(od) of the setpoint with index `row`; `od` and `row` broadcast."""
         spacing = self.log_od[1] - self.log_od[0]
         position = np.clip((np.log(od) - self.log_od[0]) / spacing, 0.0, self.log_od.size - 1.000001)
         left = position.astype(np.intp)
@@ -163,10 +163,10 @@ class OptimalPolicy:
         return np.asarray((1.0 - weight) * self.value[row, left] + weight * self.value[row, left + 1])
 
     def act(self, od: Array, setpoint: Array) -> NDArray[np.intp]:
-        """Index of the best action by one exact look-ahead from `od`.
+        """Return the best action by one exact look-ahead from `od`.
 
         Args: od: shape (N,), > 0; setpoint: shape (N,), each one of `setpoints`.
-        Raises: ValueError for a setpoint the policy was not solved for.
+        Raises: ValueError for an unsolved setpoint.
         """
         row = np.searchsorted(self.setpoints, setpoint - 1e-9)
         row = np.minimum(row, self.setpoints.size - 1)
@@ -184,7 +184,7 @@ class OptimalPolicy:
 def _solve_one(
     setpoint: float, od: Array, left: NDArray[np.intp], weight: Array, factors: Array, gamma: float
 ) -> Array:
-    """V of one setpoint on the grid `od`; action a moves grid point g to between left[g, a] and left[g, a] + 1."""
+    """Return V of one setpoint on the grid `od`; action a moves grid point g between left[g, a] and left[g, a] + 1."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import spsolve
 
@@ -212,9 +212,9 @@ def solve(config: EnvConfig, gamma: float = 0.99, setpoints: Array | None = None
     """Solve the discounted task without an end for every setpoint.
 
     Args:
-      config: the task; its 17 actions and its integrator are used as they are.
+      config: the task, with its 17 actions and integrator.
       gamma: discount per control step. setpoints: OD values, shape (M,); None takes the config's.
-      grid: number of points of log OD between a third of the lowest and twice the highest OD that can matter.
+      grid: number of points of log OD between a third of the lowest and twice the highest relevant OD.
     Returns: the optimal policy. Raises: nothing beyond NumPy's own for absurd sizes.
     """
     targets = np.unique(np.asarray(config.setpoints if setpoints is None else setpoints, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""What a step of a schedule gives beside the feed: a second medium, an inducer or a stressor by a spare pump."""
+"""Fluids of a schedule step besides the feed: a second medium, an inducer or a stressor, by a spare pump."""
 
 import re
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ PUMPS = (3, 4)
 DOSE_ML = (
     0.5  # smallest dose: more than any pump of up to 1.5 mL/s delivers dependably in 0.3 s (docs/device.md, Pumps)
 )
-MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; what was owed in a longer one is left out
+MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; the volume due in a longer one is omitted
 MOST_ML_H, MOST_ML = 20.0, 20.0
 GIVEN = re.compile(r"pump([34])\s+(\d*\.?\d+)\s*(mL/h|mL)", re.IGNORECASE)
 WORDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma between, or null"
@@ -19,7 +19,7 @@ WORDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma betwee
 
 @dataclass(frozen=True)
 class Output:
-    """What one spare pump gives in a step: so much an hour, or so much at its start."""
+    """Output of one spare pump in a step: a volume per hour, or a volume at its start."""
 
     pump: int
     ml_h: float = 0.0
@@ -27,7 +27,7 @@ class Output:
 
 
 def outputs_of(text: str | None) -> tuple[Output, ...]:
-    """Parse the outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed ones."""
+    """Parse the outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed forms."""
     found = []
     for part in (text or "").split(",") if text else []:
         said = GIVEN.fullmatch(part.strip())

@@ -1,13 +1,13 @@
-"""The control task in relative coordinates, in which one policy serves every strain, pump, volume and control period.
+"""The control task in relative coordinates, with one policy for every strain, pump, volume and control period.
 
-With h the control period and u_max the largest pump rate, B = g u_max h / tau is what one period of full pump takes off
-ln x (g: true flow of the pump over the calibrated one). Then e = ln(x/r)/B is the error in periods of full pump,
-s = mu h / B the share of the pump that growth takes, and v = u/u_max the share that is dosed:
+With h the control period and u_max the largest pump rate, B = g u_max h / tau is the decrease of ln x in one period at
+full pump rate (g: true over calibrated flow). Then e = ln(x/r)/B is the error in periods of full pump, s = mu h / B the
+growth share, and v = u/u_max the relative pump rate:
 
   e' = e + s - v
 
-which is x' = (mu - u/tau) x (paper, equation 5) integrated exactly over one period. Nothing else of strain and pump is
-left in it. Where s > 1, no pump rate holds the culture.
+which is x' = (mu - u/tau) x (paper, equation 5) integrated exactly over one period. It contains no other property of
+strain and pump. For s > 1 no pump rate holds the culture.
 """
 
 from dataclasses import dataclass
@@ -28,17 +28,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RelativeConfig:
-    """`env=relative`: the task e' = e + s - v. Raises: ValueError naming key, value and allowed range."""
+    """`env=relative`: the task e' = e + s - v. Raises: ValueError with key, value and allowed range."""
 
-    kind: str = setting("relative", "which task")
-    n_actions: int = setting(17, "shares of the largest pump rate, equally spaced on [0, 1]", within=(2, 1001))
+    kind: str = setting("relative", "task")
+    n_actions: int = setting(17, "number of pump rates, equally spaced from 0 to the largest", within=(2, 1001))
     episode_steps: int = setting(20, "control steps per episode, ended by truncation", at_least=1)
     growth_shares: tuple[float, float] = setting(
         (0.05, 0.98), "range of s, drawn uniformly per episode", above=0.0, at_most=1.0, interval=True
     )
     largest_error: float = setting(
         1.2,
-        "episodes begin within plus and minus this; further off the pump runs at full rate or not at all",
+        "episodes start within +- this error; beyond it the pump runs at full rate or not at all",
         "periods of full pump",
         within=(1.1, 100),
     )
@@ -47,17 +47,17 @@ class RelativeConfig:
         check(self, "env")
 
     def levels(self) -> Array:
-        """Return the action grid v, shares of the largest pump rate, shape (A,)."""
+        """Return the action grid v, fractions of the largest pump rate, shape (A,)."""
         return np.linspace(0.0, 1.0, self.n_actions)
 
 
 def relative_reward(error: Any) -> Any:
-    """Compute r = -e'^2 of the error reached, NumPy or tensor."""
+    """Compute r = -e'^2 of the reached error, NumPy or tensor."""
     return -error * error
 
 
 def nearest_level(error: Array, growth_share: Array, n: int = 17) -> NDArray[np.intp]:
-    """Choose the index of the level nearest to clip(e + s, 0, 1), the lower of two that are as near (myopic law)."""
+    """Choose the level nearest to clip(e + s, 0, 1), the lower of two equally near ones (myopic controller)."""
     wanted = np.clip(error + growth_share, 0.0, 1.0) * (n - 1)
     return np.asarray(np.ceil(wanted - 0.5).clip(0, n - 1), dtype=np.intp)
 
@@ -70,7 +70,7 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
     | 0           | error e                                        | any                  | periods of full pump |
     | 1           | growth's share of the pump s, of this episode  | `growth_shares`      | -                    |
 
-    Action: index a of the share v = a / (n_actions - 1) of the largest pump rate. Reward: -e'^2 of the error reached.
+    Action: index a of v = a / (n_actions - 1), fraction of the largest pump rate. Reward: -e'^2 of the reached error.
     Start: e uniform within +- `largest_error`, s uniform in `growth_shares`, both from the copy's own stream.
     End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
     """
@@ -92,8 +92,8 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
         span, (low, high) = self.config.largest_error, self.config.growth_shares
         return np.stack([span * (2.0 * numbers[:, 0] - 1.0), low + (high - low) * numbers[:, 1]], axis=1)
 
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        self.state[:, 0] += self.state[:, 1] - self._levels[actions]
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        self.state[:, 0] += self.state[:, 1] - (actions if self.continuous else self._levels[actions])
         reward: Array = relative_reward(self.state[:, 0])
         return reward
 

@@ -1,4 +1,4 @@
-"""What a culture is asked to do over time: phases with a setpoint and a temperature each, and maybe a composition."""
+"""Schedule of a culture: phases, each with a setpoint, a temperature and possibly a composition."""
 
 from dataclasses import dataclass, replace
 
@@ -13,65 +13,65 @@ __all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 
-ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
+ANNOUNCED_MIN = 360.0  # default announcement of a change of the composition
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Phases one after another, counted from the end of the recovery.
+    """Consecutive phases, counted from the end of the recovery.
 
-    Where `until` gives a phase a condition, its minutes are the longest it may take, and `edges`, `phase` and `at` are
-    those of a schedule in which no condition is met (`experiments/loop/progress.py` has them as they came).
-    The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
-    the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
-    `temperatures` holds. Raises: ValueError naming key, value and allowed range.
+    If `until` gives a phase a condition, its minutes are a limit, and `edges`, `phase` and `at` assume that no
+    condition is met (`experiments/loop/progress.py` has the actual times). The setpoint of the share of B may be given
+    per phase, or as mean - amplitude sin(2 pi t / period), t since the end of the recovery. With such a setpoint the
+    composition controller sets the temperature, otherwise `temperatures` applies. Raises: ValueError with key, value
+    and allowed range.
     """
 
-    setpoints: tuple[float, ...] = setting((0.5,), "one of each phase", "OD", above=0.0, at_most=1.5)
+    setpoints: tuple[float, ...] = setting((0.5,), "setpoint of each phase", "OD", above=0.0, at_most=1.5)
     minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
     temperatures: tuple[float | None, ...] = setting(
-        (37.0,), "thermostat in each phase; null, with two species: where both grow alike", "degC", within=(15, 42)
+        (37.0,), "thermostat in each phase; null, two species: where both grow alike", "degC", within=(15, 42)
     )
     recovery_od: float = setting(
-        0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
+        0.0, "OD to which the culture grows undiluted before the first phase; 0: no recovery", "OD", within=(0, 1.5)
     )
     recovery: str = setting(
         "grow",
-        "dilute: it grows beyond `recovery_od` by the share `settled_band`, and full pump dilutes it to there",
+        "dilute: grow beyond `recovery_od` by `settled_band`, then dilute to it with full pump",
         choices=("grow", "dilute"),
     )
-    recovery_limit_min: float = setting(600.0, "how long that may take", "min", above=0.0)
+    recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
     ratios: tuple[float | None, ...] = setting(
         (),
-        "share of the second species in each phase, null where none is asked for; empty: in no phase",
+        "setpoint of the share of B in each phase, null for none; empty: in no phase",
         above=0.0,
         below=1.0,
     )
     ratio_sine: tuple[float, ...] = setting(
-        (), "in place of ratios a sine that falls first: mean, amplitude and period in min; empty: none"
+        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
     )
     announce_min: float | None = setting(
         None,
-        "how long ahead the controllers know of a change of the setpoint or the share; 0: never; null: 360 where a "
-        "share is asked for, else 0",
+        "time by which controllers know a change of setpoint in advance; 0: never; null: 360 with a composition, else "
+        "0",
         "min",
         within=(0, 1440),
     )
     until: tuple[str | None, ...] = setting(
         (),
-        "what ends each phase before its minutes are over: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: nothing",
+        "condition that ends a phase early: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: none",
     )
     outputs: tuple[str | None, ...] = setting(
         (),
-        "what each phase gives by a spare pump: 'pump3 2 mL/h', 'pump4 1.5 mL' at its start, or null; empty: nothing",
+        "spare pump in each phase: 'pump3 2 mL/h', 'pump4 1.5 mL' at its start, or null; empty: none",
     )
     settled_band: float = setting(
         0.05,
-        "settled: |OD - setpoint| within this share of the setpoint, as the settling time of the summary",
+        "settled: |OD - setpoint| within this fraction of the setpoint, as for the settling time of the summary",
         "",
         within=(0.005, 0.5),
     )
-    settled_min: float = setting(10.0, "and so for so long without a reading outside", "min", within=(1, 1440))
+    settled_min: float = setting(10.0, "time without a reading outside that band", "min", within=(1, 1440))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
@@ -80,7 +80,7 @@ class Scenario:
             phases > 0 and set(beside) == {phases},
             "scenario.setpoints, minutes, temperatures",
             "lists of {}, {} and {}".format(*lengths),
-            "one or more setpoints, and an entry of minutes and of temperatures for each of them",
+            "one or more setpoints, and as many minutes and temperatures; decimals have a point: 0.5",
         )
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
@@ -120,22 +120,22 @@ class Scenario:
 
     @property
     def composed(self) -> bool:
-        """Whether a share is asked for at any time."""
+        """Whether the schedule has a composition."""
         return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
 
     @property
     def announced_min(self) -> float:
-        """How long ahead a change is known, min; 0: never."""
+        """Time by which a change is announced, min; 0: never."""
         usual = ANNOUNCED_MIN if self.composed else 0.0
         return usual if self.announce_min is None else self.announce_min
 
     def resting(self, even_c: float) -> "Scenario":
-        """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""
+        """Return the schedule with a temperature in every phase; the default is that of equal growth, degC."""
         return replace(self, temperatures=tuple(even_c if t is None else t for t in self.temperatures))
 
     @property
     def supplied(self) -> frozenset[int]:
-        """The spare pumps that any phase gives by."""
+        """Spare pumps of all phases."""
         return frozenset(output.pump for text in self.outputs for output in outputs_of(text))
 
     @property
@@ -155,7 +155,7 @@ class Scenario:
         return np.where(started, np.minimum(index, len(self.setpoints) - 1), -1).astype(np.intp)
 
     def at(self, minute: Array) -> tuple[Array, Array]:
-        """Setpoint and temperature at each minute since the recovery ended, each the shape of `minute`.
+        """Return setpoint and temperature at each minute since the recovery ended, each the shape of `minute`.
 
         Before the start (minute < 0 or nan) they are those of the first phase.
         """

@@ -19,10 +19,10 @@ MAX_PUMP_RATE = 0.02
 """mL/s. The Chi.Bio's own regulator never exceeds a duty of 0.02 of a 1 mL/s pump (docs/device.md, Regulation)."""
 
 MAX_OD = 1000.0
-"""Keeps a runaway culture finite: 100 steps at mu = 0.1/min from OD 4 reach 1e5, no culture does."""
+"""Limit of the OD: 100 steps at mu = 0.1/min from OD 4 would reach 1e5."""
 
 SCORED_OD = (0.1, 1.1)
-"""Range of the starts from which policies are scored, whatever `start_od` is."""
+"""Range of the scored starts, independent of `start_od`."""
 
 
 def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
@@ -39,11 +39,11 @@ def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Training model x' = (mu - u/tau) x, equation (5) of the paper, and the episode built on it.
+    """Training model x' = (mu - u/tau) x, equation (5) of the paper, and its episode.
 
-    The paper reports neither mu nor tau. The nominal ones are E. coli in rich medium at 37 degC with a plasmid
-    (0.020 to 0.031 1/min in the literature), and a vial of 20 mL fed by 1 mL/s at full power (tau = V/60).
-    Raises: ValueError naming key, value and allowed range.
+    The paper reports neither mu nor tau. The nominal values are E. coli in rich medium at 37 degC with a plasmid (0.020
+    to 0.031 1/min in the literature), and a vial of 20 mL with a pump of 1 mL/s (tau = V/60). Raises: ValueError with
+    key, value and allowed range.
     """
 
     mu: float = setting(
@@ -57,14 +57,14 @@ class EnvConfig:
         note="20 mL and a 1 mL/s pump: 0.333",
     )
     control_min: float = setting(1.0, "control period (paper)", "min", above=0.0, at_most=60.0)
-    integrator: str = setting("euler", "the paper names no scheme", choices=tuple(INTEGRATORS))
+    integrator: str = setting("euler", "integration scheme (not stated in the paper)", choices=tuple(INTEGRATORS))
     substeps: int = setting(10, "integration steps per control period (paper: 0.1 min)", within=(1, 10_000))
-    n_actions: int = setting(17, "pump rates, equally spaced on [0, max_pump_rate] (paper)", within=(2, 1001))
+    n_actions: int = setting(17, "number of pump rates, equally spaced on [0, max_pump_rate] (paper)", within=(2, 1001))
     max_pump_rate: float = setting(MAX_PUMP_RATE, "largest pump rate (paper)", "mL/s", above=0.0, at_most=0.05)
     episode_steps: int = setting(100, "control steps per episode, ended by truncation (paper)", at_least=1)
     setpoints: tuple[float, ...] = setting(
         (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
-        "one is drawn per episode (paper)",
+        "setpoints, one drawn per episode (paper)",
         "OD",
         above=0.0,
         at_most=1.5,
@@ -72,7 +72,7 @@ class EnvConfig:
     )
     start_od: tuple[float, float] = setting(
         (0.1, 1.1),
-        "uniform range of starts; not in the paper: a little wider than the setpoints on both sides",
+        "range of the initial OD, slightly wider than the setpoints (not in the paper)",
         "OD",
         above=0.0,
         at_most=4.0,
@@ -80,7 +80,7 @@ class EnvConfig:
     )
     final_reward_weight: float = setting(
         1.0,
-        "weight of the final reward of equation (4); the paper gives no form, so the last state counts as every other",
+        "weight of the final reward of equation (4); the paper gives no form, 1 counts the last state as every other",
         at_least=0.0,
     )
 
@@ -93,10 +93,10 @@ class EnvConfig:
 
 
 def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
-    """Compute f with x(t + control period) = f x(t) for a pump rate held over the period, shape of `rates`.
+    """Compute f with x(t + control period) = f x(t) for a constant pump rate, shape of `rates`.
 
-    The model is linear in x, so the configured integrator, run once from x = 1 with all its sub-steps, gives f
-    exactly: for Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
+    The model is linear in x, so the configured integrator, run once from x = 1 with all sub-steps, gives f exactly: for
+    Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
 
     Args: config: the task. rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
     """
@@ -110,7 +110,7 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
 
 
 def tracking_reward(od: T, setpoint: T) -> T:
-    """Compute r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
+    """Compute r = -(x - setpoint)^2 (paper, equation 4) of the OD after the step.
 
     Args: od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
     Returns: shape of the broadcast. Raises: nothing.

@@ -1,4 +1,4 @@
-"""Conditions under which a step of a schedule ends before its longest time."""
+"""Conditions that end a step of a schedule early."""
 
 import re
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ COMPARED = re.compile(r"od\s*(>=|<=)\s*(\d*\.?\d+)")
 
 @dataclass(frozen=True)
 class Condition:
-    """What ends a step: "od >= LEVEL", "od <= LEVEL", "settled"; None ends it by its time alone.
+    """Condition that ends a step: "od >= LEVEL", "od <= LEVEL", "settled"; None: only its time.
 
-    Raises: ValueError for any other text, with the allowed ones.
+    Raises: ValueError for any other text, with the allowed forms.
     """
 
     text: str | None = None
@@ -37,7 +37,7 @@ class Condition:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The OD that ends the step is at least the first or at most the second; inf and -inf where there is none."""
+        """Limits: an OD of at least the first or at most the second ends the step; inf and -inf for none."""
         found = COMPARED.fullmatch(self.text or "")
         level = float(found[2]) if found else np.nan
         return (level if found and found[1] == ">=" else np.inf, level if found and found[1] == "<=" else -np.inf)
@@ -46,7 +46,7 @@ class Condition:
 class Conditions:
     """The conditions of N reactors' steps, (N, P); rows shorter than P are padded with None.
 
-    Attributes: given, where there is one, (N, P); any, whether there is one at all; texts, as written.
+    Attributes: given, (N, P), whether there is a condition; any, whether there is one at all; texts, as written.
     """
 
     def __init__(self, texts: list[list[str | None]]) -> None:
@@ -58,9 +58,9 @@ class Conditions:
         self.any = bool(self.given.any())
 
     def met(self, phase: NDArray[np.intp], od: Array, settled: Mask) -> Mask:
-        """Whether each reactor's step ends, (N,): OD at its level, or settled where that is asked for.
+        """Return whether each reactor's step ends, (N,): OD at its level, or settled if required.
 
-        Args: phase: of each reactor, >= 0. od: nan meets nothing. settled: by whoever keeps the time.
+        Args: phase: of each reactor, >= 0. od: nan meets no condition. settled: determined by the caller.
         """
         row = np.arange(phase.size)
         reached = (od >= self._least[row, phase]) | (od <= self._most[row, phase])

@@ -1,4 +1,4 @@
-"""N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
+"""N parallel training episodes as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
 
 import reprlib
 from abc import abstractmethod
@@ -24,7 +24,7 @@ EPISODES_PER_BLOCK = 64
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
-    """Actions as an array of `shape`. Raises: ValueError unless they are integers of that shape, 0 to n_actions - 1."""
+    """Return actions as an array of `shape`. Raises: ValueError unless they are integers from 0 to n_actions - 1."""
     given = np.asarray(actions)
     if given.shape != shape or given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= n_actions:
         raise ValueError(
@@ -35,7 +35,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDA
 
 
 class EpisodeSpec:
-    """`spec` of an environment with a `config`: what Gymnasium registers, with how long episodes are; no pictures.
+    """`spec` of an environment with a `config`: Gymnasium's, with the length of episodes; no rendering.
 
     Environments truncate by themselves, so no time limit is registered.
     """
@@ -45,7 +45,7 @@ class EpisodeSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium registers, with the episode's length."""
+        """Gymnasium's spec, with the episode's length."""
         return self._spec
 
     @spec.setter
@@ -53,15 +53,15 @@ class EpisodeSpec:
         self._spec = None if value is None else replace(value, max_episode_steps=self.config.episode_steps)
 
     def render(self) -> None:
-        """None and a warning, as Gymnasium's environments do without a `render_mode`: there is nothing to draw."""
+        """Return None and warn, as Gymnasium's environments do without a `render_mode`."""
         logger.warn("this environment has nothing to draw; plot what `reset` and `step` return")
 
 
 class EpisodeStreams:
-    """Uniform numbers for each episode of each copy (start, setpoint), each copy from a generator of its own.
+    """Uniform numbers for each episode of each copy (start, setpoint), from one generator per copy.
 
-    Copy i draws the same numbers whatever N is. Numbers are drawn in blocks, so that a reset of thousands of copies
-    costs no Python loop; the state is that of the generators before their block, and how far into it each copy is.
+    Copy i draws the same numbers for every N. Numbers are drawn in blocks, so a reset of thousands of copies needs no
+    Python loop. The state has the generators before their block and the position of each copy in it.
     """
 
     def __init__(self, seeds: Sequence[int | np.random.SeedSequence], numbers: int = 2) -> None:
@@ -78,7 +78,7 @@ class EpisodeStreams:
         self._position[copies] = 0
 
     def take(self, copies: NDArray[np.intp]) -> Array:
-        """Numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
+        """Return numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
         used_up = copies[self._position[copies] == EPISODES_PER_BLOCK]
         if used_up.size:
             self._refill(used_up)
@@ -99,27 +99,27 @@ class EpisodeStreams:
 
 
 class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
-    """N copies of a task whose episodes have a fixed length; a task says how they begin and how they advance.
+    """N copies of a task with episodes of fixed length; a task defines how they begin and advance.
 
-    `state` (N, O) holds every copy's observation in full precision: what changes, and the goal or parameter.
+    `state` (N, O) holds every copy's observation in full precision: the state, and the goal or parameter.
     End: never terminated; truncated after `config.episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
-    the step after it starts the next episode, whatever the action, with reward 0 (Gymnasium's stateful wrappers).
+    the next step ignores its action and starts the next episode, with reward 0 (Gymnasium's stateful wrappers).
 
     Args:
       num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
-      render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
-    Raises: ValueError naming what is not allowed, or a value that the task does not have and those it has; TypeError
-      for a `render_mode`.
+      render_mode: None; there is no drawing. max_episode_steps: Gymnasium's name; ends episodes that are longer.
+      continuous: actions are numbers from 0 to 1, shape (N, 1), in the place of indices: anywhere on the grid's range.
+    Raises: ValueError with the invalid value, or an unknown key and the known ones; TypeError for a `render_mode`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
     default: type[C]
     names: tuple[str, ...]
-    """Of the numbers of an observation, in their order; a reset's options may give them."""
+    """Names of the observation's numbers, in order; options of a reset may set them."""
     numbers = 2
-    """Uniform numbers that an episode begins from."""
+    """Number of uniform numbers for the start of an episode."""
 
     config: C
 
@@ -131,6 +131,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
+        continuous: bool = False,
         **overrides: Any,
     ) -> None:
         if config is None:
@@ -139,7 +140,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
             config = self.default(**overrides)
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)
-        if render_mode is not None:  # a TypeError: Stable-Baselines3 asks for a picture, and goes on without
+        if render_mode is not None:  # a TypeError: Stable-Baselines3 requests rendering, and continues without
             raise TypeError(f"render_mode = {render_mode}: allowed None (there is nothing to draw)")
         modes = {AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP}
         allowed = ", ".join(sorted(str(mode) for mode in modes))
@@ -148,7 +149,9 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         self.num_envs = num_envs
         self.render_mode = None
         self.single_observation_space = self.observations(self.config)
-        self.single_action_space = spaces.Discrete(self.config.n_actions)
+        self.continuous = continuous
+        share = spaces.Box(0.0, 1.0, (1,), np.float32)
+        self.single_action_space = share if continuous else spaces.Discrete(self.config.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state = np.ones((num_envs, *self.single_observation_space.shape))
@@ -163,18 +166,18 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Space of one copy's observations."""
 
     def _prepare(self) -> None:
-        """Compute what a task needs once."""
+        """Prepare the task once."""
 
     @abstractmethod
     def _begun(self, numbers: Array) -> Array:
-        """State (K, O) of new episodes from uniform numbers, (K, numbers)."""
+        """Return the state (K, O) of new episodes from uniform numbers, (K, numbers)."""
 
     @abstractmethod
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        """Change `state` by one control period; the rewards (N,)."""
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        """Advance `state` by one period; return the rewards (N,). Args: actions: indices, or numbers from 0 to 1."""
 
     def _weigh(self, last: Array) -> Array:
-        """Rewards of the last steps of episodes, (K,)."""
+        """Return the rewards of the last steps of episodes, (K,)."""
         return last
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
@@ -197,11 +200,11 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Start new episodes.
 
         Args:
-          seed: an integer (copy i gets seed + i), one integer or None per copy, or None to go on with the streams.
-          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` is how
-            they start, instead of as drawn, {"od": 0.3, "setpoint": 0.5}.
+          seed: an integer (copy i gets seed + i), one integer or None per copy, or None to continue the streams.
+          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` sets the
+          start instead of a random draw, {"od": 0.3, "setpoint": 0.5}.
         Returns: observations (N, O), {}.
-        Raises: ValueError if the mask has another shape, or naming an option that there is not or a value out of range.
+        Raises: ValueError for a mask of another shape, an unknown option or a value out of range.
         """
         if isinstance(seed, int):
             seed = [seed + i for i in range(self.num_envs)]
@@ -220,13 +223,13 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return self._observe(), {}
 
     def _column(self, name: str) -> int:
-        """Which number of an observation. Raises: ValueError."""
+        """Return the column of a named number of the observation. Raises: ValueError."""
         names = self.names[: self.state.shape[1]]
         require(name in names, "reset option", name, ", ".join(("reset_mask", *names)))
         return names.index(name)
 
     def _checked(self, name: str, value: Any) -> Array:
-        """Check a start that a reset was given, (N,). Raises: ValueError."""
+        """Check a start given to a reset, (N,). Raises: ValueError."""
         space, column = self.observations(self.config), self._column(name)
         low, high = float(space.low[column]), float(space.high[column])
         given = np.asarray(value, dtype=np.float64)
@@ -237,18 +240,16 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     def step(
         self, actions: NDArray[np.intp]
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One control period in every copy.
+        """Advance every copy by one control period.
 
-        Args: actions: indices of pump rates, shape (N,), integers.
+        Args: actions: indices of the action grid, shape (N,), integers; `continuous`: numbers from 0 to 1, (N, 1).
         Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
-          where an episode ended, infos["final_obs"] (N, O) holds its last observation and infos["_final_obs"] (N,)
-          says where.
+        infos["final_obs"] (N, O) has the last observations of ended episodes and infos["_final_obs"] (N,) their mask.
         Raises: RuntimeError before the first reset; ValueError for actions of another shape or outside the grid.
         """
         if self._streams is None:
             raise RuntimeError("step before reset: call reset(seed=...) first")
-        actions = checked_actions(actions, (self.num_envs,), self.config.n_actions)
-        reward = self._advance(actions)
+        reward = self._advance(self.checked(actions, (self.num_envs,)))
         self._steps += 1
         if self._waiting.any():
             reward[self._waiting] = 0.0
@@ -257,8 +258,17 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         infos = self._end(truncated, reward) if truncated.any() else {}
         return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
 
+    def checked(self, actions: Any, copies: tuple[int, ...]) -> NDArray[Any]:
+        """Check actions, indices or numbers from 0 to 1; returns the shape of `copies`. Raises: ValueError."""
+        if not self.continuous:
+            return checked_actions(actions, copies, self.config.n_actions)
+        given = np.asarray(actions, dtype=np.float64)
+        fits = given.shape == (*copies, 1) and bool(np.all((given >= 0.0) & (given <= 1.0)))
+        require(fits, "action", reprlib.repr(given.tolist()), f"numbers from 0 to 1, shape {(*copies, 1)}")
+        return given[..., 0]
+
     def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
-        """Weigh the last reward of ended episodes, in place, and begin the next ones or let them wait; the infos."""
+        """Weight the last reward of ended episodes in place, begin the next ones or let them wait; return infos."""
         reward[truncated] = self._weigh(reward[truncated])
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._waiting = truncated.copy()
@@ -288,7 +298,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
 
 class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
-    """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
+    """A culture at a setpoint, with a choice of the pump rate every control period (paper, sections 2 and 3).
 
     Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
 
@@ -308,7 +318,7 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:
-        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is capped where no sensor reads further."""
+        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is limited to the range of a sensor."""
         return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
 
     def _prepare(self) -> None:
@@ -330,8 +340,10 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
         setpoint = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
         return np.stack([low + (high - low) * numbers[:, 0], setpoint], axis=1)
 
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
-        np.minimum(self.od * self._factors[actions], MAX_OD, out=self.od)
+    def _advance(self, actions: NDArray[Any]) -> Array:
+        rates = actions * self.config.max_pump_rate
+        factors = step_factors(self.config, rates) if self.continuous else self._factors[actions]
+        np.minimum(self.od * factors, MAX_OD, out=self.od)
         return tracking_reward(self.od, self.setpoint)
 
     def _weigh(self, last: Array) -> Array:

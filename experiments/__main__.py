@@ -13,7 +13,7 @@ from experiments.cli.start import version
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
     "At the device": ("calibrate_pump", "blank", "mark", "calibrate_pair"),
-    "Side by side": ("benchmark",),
+    "Side by side": ("benchmark", "score"),
 }
 DEMO = "The whole way in one command: calibrate, train, deploy, report."
 USAGE = """\

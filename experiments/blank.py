@@ -25,11 +25,9 @@ class BlankConfig:
     """Which reactors to measure, and for how long. Raises: ValueError naming key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
-    warm_up: float = setting(90.0, "how long the medium may take to its temperature", "min", within=(0, 600))
-    tolerance: float = setting(
-        1.0, "of the temperature from that of the thermostat at which it counts as reached", "degC", within=(0.2, 15)
-    )
-    samples: int = setting(6, "to average, one reading each", "min", within=(3, 60), note="one a minute")
+    warm_up: float = setting(90.0, "longest time for the medium to reach its temperature", "min", within=(0, 600))
+    tolerance: float = setting(1.0, "largest difference to the thermostat's target", "degC", within=(0.2, 15))
+    samples: int = setting(6, "number of averaged readings", "min", within=(3, 60), note="one a minute")
 
     def __post_init__(self) -> None:
         check(self)

@@ -37,21 +37,21 @@ class CalibratePairConfig:
     """Which recordings. Raises: ValueError naming key, value and allowed range."""
 
     first: tuple[str, ...] = setting((), "recordings of the first species alone, at several temperatures")
-    second: tuple[str, ...] = setting((), "recordings of the second, whose pigment is counted")
-    names: tuple[str, ...] = setting(("first", "second"), "what figures call the two species")
+    second: tuple[str, ...] = setting((), "recordings of the second species, whose pigment is measured")
+    names: tuple[str, ...] = setting(("first", "second"), "names of the two species in figures")
     mixed: str | None = setting(
-        None, "recording of a deployment with both: shares that were marked in its run correct both curves"
+        None, "recording of a deployment with both; the marked shares of its run correct both curves"
     )
     pump_ml_s: float = setting(0.02, "mL/s of a pump rate of 1 in a Chi.Bio's own CSV", "mL/s", above=0.0, at_most=1.0)
-    volume_ml: float = setting(Bench.volume_ml, "of all these cultures", "mL", within=(1, 2000))
-    degree: int = setting(2, "of both curves, less where there are fewer temperatures", within=(1, 4))
+    volume_ml: float = setting(Bench.volume_ml, "culture volume of all these recordings", "mL", within=(1, 2000))
+    degree: int = setting(2, "degree of both curves, less with fewer temperatures", within=(1, 4))
     settle_min: float = setting(
-        120.0, "after a change of temperature, which is left out; or four of a species' lags", "min", within=(0, 600)
+        120.0, "ignored after a change of temperature; at least four lags", "min", within=(0, 600)
     )
-    least_min: float = setting(60.0, "behind that, at one temperature", "min", within=(30, 2000))
-    lags_min: tuple[float, ...] = setting((2.0, 60.0), "with which growth follows temperature, of both", "min")
+    least_min: float = setting(60.0, "shortest time after that at one temperature", "min", within=(30, 2000))
+    lags_min: tuple[float, ...] = setting((2.0, 60.0), "time constants of growth after a change of temperature", "min")
     factor: float = setting(0.99, "k of the light k (pigment + od_term OD) + offset", within=(0.05, 20))
-    offset: float = setting(214.0, "of the light", "counts", within=(0, 20_000))
+    offset: float = setting(214.0, "offset of the light", "counts", within=(0, 20_000))
     od_term: float = setting(150.0, "light that cells of any kind scatter", "counts/OD", within=(0, 5000))
 
     def __post_init__(self) -> None:

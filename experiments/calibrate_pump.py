@@ -46,14 +46,14 @@ class CalibratePumpConfig:
     """What to weigh. Raises: ValueError naming key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device")
-    reactor: str = setting("M0", "position", choices=POSITIONS)
-    pump: str = setting("feed", "which pump", choices=tuple(PUMP_OF))
+    reactor: str = setting("M0", "reactor position", choices=POSITIONS)
+    pump: str = setting("feed", "pump to weigh", choices=tuple(PUMP_OF))
     duties: tuple[float, ...] = setting(
         (0.006, 0.01, 0.02, 0.04),
-        "of 63 s at full power; weigh doses of the sizes that will be used; two or more, 0.003 to 0.05 (feed) or 0.5",
+        "on-times as fractions of 63 s, two or more, of the sizes that will be used: 0.003 to 0.05 (feed) or 0.5",
     )
-    doses: int = setting(20, "per weighing", within=(3, 200))
-    csv: str | None = setting(None, "weighings already made, columns duty,doses,grams; nothing is pumped then")
+    doses: int = setting(20, "doses per weighing", within=(3, 200))
+    csv: str | None = setting(None, "existing weighings, columns duty,doses,grams; no pump runs then")
 
     def __post_init__(self) -> None:
         check(self)

@@ -26,23 +26,23 @@ USUAL_SD = 0.03
 class MarkConfig:
     """What happened, to which reactor of which run, and when."""
 
-    run: str = setting("", "folder of a deployment, running or over; or `latest`")
-    reactor: str = setting("", "which one; empty: all of them")
-    text: str = setting("inoculated", "what happened, in one line of at most 80 characters")
+    run: str = setting("", "folder of a running or finished deployment, or `latest`")
+    reactor: str = setting("", "reactor; empty: all")
+    text: str = setting("inoculated", "event, in one line of at most 80 characters")
     level_ml: float | None = setting(
-        None, "volume read off the vial: the ledger of a run under way is set to it, and the unit's own", "mL",
+        None, "volume read from the vial; sets the ledger of a running deployment, and the unit's own", "mL",
         within=(0, 40),
     )  # fmt: skip
     share: float | None = setting(
-        None, "of the second species, counted in a sample: a run under way estimates with it", above=0.0, below=1.0
+        None, "share of B, counted in a sample; a running deployment uses it in its estimate", above=0.0, below=1.0
     )
-    sd: float | None = setting(None, "of that share; null: 0.03", within=(0.001, 0.5))
+    sd: float | None = setting(None, "sd of that share; null: 0.03", within=(0.001, 0.5))
     bottle_ml: float | None = setting(
-        None, "what its bottle was filled to: a run under way doses on from it", "mL", within=(1, 100_000)
+        None, "volume to which the bottle was filled; a running deployment counts from it", "mL", within=(1, 100_000)
     )
     minute: float | None = setting(
         None,
-        "of the run at which it happened, or the sample was drawn; null: now",
+        "minute of the run of the event or sample; null: now",
         "min",
         within=(-1440.0, 1_000_000.0),
     )

@@ -26,9 +26,7 @@ class ReportConfig:
     """What to report on."""
 
     run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
-    runs: str | None = setting(
-        None, "the folder of a sweep, or `latest`, whose jobs are compared on one page; replaces run"
-    )
+    runs: str | None = setting(None, "the folder of a sweep, or `latest`: compare its jobs on one page; replaces run")
 
 
 def _summary(run: Path) -> Any:

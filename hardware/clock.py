@@ -24,14 +24,14 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """Real time, for sockets, messages and processes: the machine's monotonic clock, 0 when this object was made."""
+    """Real time, for devices, sockets, messages and processes: `uptime` since this object was made."""
 
     def __init__(self) -> None:
-        self._start = time.monotonic()
+        self._start = uptime()
 
     def now(self) -> float:
         """Real seconds."""
-        return time.monotonic() - self._start
+        return uptime() - self._start
 
     def sleep(self, seconds: float) -> None:
         """Wait real seconds."""

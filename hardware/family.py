@@ -23,7 +23,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.clock import run_time
-from hardware.errors import DeviceStateError, ReactorError, RecordingError, UnfitError
+from hardware.errors import DeviceStateError, LinkError, ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
 
@@ -273,12 +273,13 @@ def _looked_at(reactors: Reactor) -> Iterator[Check]:
 
 
 @contextmanager
-def not_looked_at() -> Iterator[None]:
-    """Who stops it in here is told that nobody has looked at the pumps: an earlier life may have left one on."""
+def not_looked_at(resumed: bool) -> Iterator[None]:
+    """Who stops it here, or resumes in vain, is told that nobody looked at the pumps: one may have been left on."""
     try:
         yield
-    except KeyboardInterrupt:
-        log.warning("stopped before the pumps were looked at: pumps not verified off")
+    except (KeyboardInterrupt, LinkError) as error:
+        if resumed or not isinstance(error, LinkError):
+            log.warning("stopped before the pumps were looked at: pumps not verified off")
         raise
 
 

@@ -21,10 +21,10 @@ class SimulatedConfig:
     Raises: ValueError naming key, value and allowed range.
     """
 
-    kind: str = setting("sim", "which backend")
-    reactors: tuple[str, ...] = setting(("M0",), "one simulated vial each", some=True)
-    pump_ml_s: float = setting(1.0, "believed flow of the feed pump at full power", "mL/s", above=0.0, at_most=10.0)
-    seed: int = setting(0, "of everything the plant draws", at_least=0)
+    kind: str = setting("sim", "backend")
+    reactors: tuple[str, ...] = setting(("M0",), "names of the simulated vials", some=True)
+    pump_ml_s: float = setting(1.0, "calibrated flow of the feed pump at full power", "mL/s", above=0.0, at_most=10.0)
+    seed: int = setting(0, "random seed of the plant", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "backend")

@@ -129,17 +129,20 @@ README = {
     if words[0] not in ("turbidostat", "experiments.demo", "experiments.certify", "hardware.emulator")
     and not needs_hardware(words)
 }
-QUICK = "experiments", "experiments.calibrate", "experiments.train env_file=latest", "experiments.deploy policy=latest"
+QUICK = (
+    "experiments", "experiments.calibrate", "experiments.train env_file=latest",
+    "experiments.deploy policy=latest env_file=latest",
+)  # fmt: skip
 """Lines of every run of the suite; their figures are blank."""
 
 
 def before(shown: str) -> str | None:
     """The line of the README whose files this one reads."""
     lines = [*README][: [*README].index(shown)]
-    if "_file=latest" in shown or "report" in shown:
-        writer = "-m " if "runs=" in shown else "calibrate"
-    elif "policy=latest" in shown:
+    if "policy=latest" in shown:
         writer = "train env_file=latest"
+    elif "_file=latest" in shown or "report" in shown:
+        writer = "-m " if "runs=" in shown else "calibrate"
     else:
         writer = "stop_within" if "resume=latest" in shown else None
     return None if writer is None else next(line for line in lines if writer in line)

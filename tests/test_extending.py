@@ -46,9 +46,9 @@ def summary(folder: Path) -> dict[str, object]:
 
 
 def test_the_page_names_every_file_it_shows() -> None:
-    names = "steps.yaml", "gentle.py", "patient.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py"
+    names = "steps.yaml", "gentle.py", "patient.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py", "mine.py"
     assert set(FILES) == set(names)
-    assert len(COMMANDS) == 15
+    assert len(COMMANDS) == 18
 
 
 @pytest.mark.slow

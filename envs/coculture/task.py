@@ -183,9 +183,11 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
         time = preview.minutes_ahead(c.control_min, c.preview_min, numbers[:, 4:])
         return np.concatenate([state, goal, time], axis=1)
 
-    def _advance(self, actions: NDArray[np.intp]) -> Array:
+    def _advance(self, actions: NDArray[Any]) -> Array:
         wanted = self.state[:, SETPOINT].copy()
-        self.state[:, :3] = advance(self.config, self.state[:, :3], self._targets[actions], self.config.control_min)
+        coldest, warmest = self.config.span
+        target = coldest + (warmest - coldest) * actions if self.continuous else self._targets[actions]
+        self.state[:, :3] = advance(self.config, self.state[:, :3], target, self.config.control_min)
         np.clip(self.state[:, LOGIT], -LARGEST, LARGEST, out=self.state[:, LOGIT])
         self.state[:, 3:] = passed(self.config, self.state[:, 3:])
         reward: Array = -np.square(share(self.state[:, LOGIT]) - share(wanted))

@@ -35,13 +35,13 @@ class IdentifyConfig:
 
     method: str = setting(
         "prediction_error",
-        "prediction_error holds also where the pump answers the OD; free_run: the paper's least squares, for open loop",
+        "free_run: the paper's least squares, for open loop; prediction_error: also for feedback",
         choices=("prediction_error", "free_run"),
     )
-    window: str = setting("auto", "the longest stretch without drift, or all rows", choices=("auto", "all"))
+    window: str = setting("auto", "auto: the longest stretch without drift; all: all rows", choices=("auto", "all"))
     pmse_limit: float = setting(
         0.5,
-        "of predictions (the paper's model reached 6 %); three times that of the sensor's noise where that is larger",
+        "largest PMSE of predictions without a warning (the paper's model: 6 %), at least 3 times the sensor's",
         "%",
         above=0.0,
         at_most=100.0,
@@ -49,9 +49,9 @@ class IdentifyConfig:
     )
     segment_min: float = setting(120.0, "length of the segments of the drift report", "min", within=(20, 1440))
     horizon_min: float = setting(
-        60.0, "of the predictions of unseen readings, each from a fresh start", "min", within=(20, 1440)
+        60.0, "prediction horizon of the validation on unseen readings", "min", within=(20, 1440)
     )
-    seed: int = setting(0, "of the noise models that the estimate is averaged over", at_least=0)
+    seed: int = setting(0, "random seed of the noise models that the estimate is averaged over", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "identify")

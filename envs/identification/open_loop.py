@@ -28,27 +28,25 @@ class OpenLoop:
     """
 
     mu: float = setting(0.028, "specific growth rate", "1/min", above=0.0, at_most=0.1)
-    tau: float = setting(
-        0.31, "u/tau is the dilution rate in 1/min; below 0.02/mu, so that the pump outruns growth", above=0.0
-    )
-    start_od: float = setting(0.12, "at the start", "OD", above=0.0, at_most=2.0)
+    tau: float = setting(0.31, "u/tau is the dilution rate in 1/min; below 0.02/mu: the pump outruns growth", above=0.0)
+    start_od: float = setting(0.12, "OD at the start", "OD", above=0.0, at_most=2.0)
     hours: float = setting(6.0, "length of the recording", "h", within=(1, 100))
-    control_min: float = setting(1.0, "between rows", "min", within=(0.1, 10))
+    control_min: float = setting(1.0, "time between rows", "min", within=(0.1, 10))
     keep_od: tuple[float, float] = setting(
         (0.08, 1.2),
-        "outside, a new rate is drawn at once from the half that leads back (not in the paper)",
+        "OD range; outside it a new pump rate that leads back is drawn at once (not in the paper)",
         "OD",
         above=0.0,
         interval=True,
     )
     noise: float = setting(0.01, "sd of a reading relative to the OD", within=(0, 0.2))
     noise_correlation: float = setting(0.12, "from row to row; median of public Chi.Bio logs", within=(0, 0.95))
-    outlier_share: float = setting(0.0, "share of readings that are off by 10 to 50 %", within=(0, 0.2))
-    dose_cv: float = setting(0.0, "sd of a dose over its size", within=(0, 0.5))
-    growth_cv: float = setting(0.0, "sd of growth that wanders, over mu", within=(0, 0.5))
-    growth_memory_min: float = setting(30.0, "after which wandering growth has forgotten 63 %", "min", within=(1, 1000))
-    late_share: float = setting(0.0, "share of a dose that is seen one row late", within=(0, 1))
-    seed: int = setting(1, "of rates, noise and disturbances", at_least=0)
+    outlier_share: float = setting(0.0, "fraction of readings that are off by 10 to 50 %", within=(0, 0.2))
+    dose_cv: float = setting(0.0, "sd of a dose relative to its volume", within=(0, 0.5))
+    growth_cv: float = setting(0.0, "sd of the fluctuating growth rate relative to mu", within=(0, 0.5))
+    growth_memory_min: float = setting(30.0, "correlation time of the growth fluctuations", "min", within=(1, 1000))
+    late_share: float = setting(0.0, "fraction of a dose that is seen one row late", within=(0, 1))
+    seed: int = setting(1, "random seed of pump rates, noise and disturbances", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "protocol")

@@ -1,4 +1,4 @@
-"""How a value changes with age: straight lines between knots."""
+"""A value over age: linear interpolation between knots."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 def along(knots_min: Sequence[float], knots: Sequence[float], mean: float, age_min: Array) -> Array:
     """Interpolate the value at each age over `mean`, shape (N,): linear between knots, constant beyond them.
 
-    Args: knots_min, knots: ages in min and values; none of them means a constant, 1. mean: > 0 where there are knots.
+    Args: knots_min, knots: ages in min and values; empty: constant 1. mean: > 0 if there are knots.
       age_min: min, shape (N,).
     """
     return np.interp(age_min, knots_min, knots) / mean if len(knots) else np.ones_like(age_min)

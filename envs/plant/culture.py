@@ -1,4 +1,4 @@
-"""The culture: suspended cells, their substrate, and what grows on the wall."""
+"""The culture: suspended cells, their substrate, and biomass on the wall."""
 
 import math
 from dataclasses import dataclass
@@ -18,52 +18,52 @@ __all__ = ["Culture", "GrowthConfig"]
 
 Array = NDArray[np.float64]
 
-SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (docs/biology.md, Stirring)
-SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (docs/biology.md, Stirring)
+SETTLED_FRACTION = 0.08  # fraction of the OD lost from the light path without stirring (docs/biology.md, Stirring)
+SETTLING_MIN = 1.5  # min, for a loss within about three readings (docs/biology.md, Stirring)
 SUBSTEP_MIN = 0.1  # longest integration step (paper)
 UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Stirring)
 
 
 @dataclass(frozen=True)
 class GrowthConfig:
-    """How cells grow; the defaults are the training model's. Every temperature law is 1 at 37 degC (envs/growth.py)."""
+    """Growth of the culture; the defaults are the training model. Every temperature response is 1 at 37 degC."""
 
     mu: float = setting(0.03, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
-    mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
+    mu_cv: float = setting(0.0, "relative spread of mu between cultures", within=(0, 0.3))
     drift_sd_per_h: float = setting(0.0, "random walk of ln mu: sd after 1 h", "1/sqrt(h)", within=(0, 0.2))
     ramp_per_h: float = setting(0.0, "relative change of mu per hour (burden, pH, oxygen)", "1/h", within=(-0.5, 0.5))
     knots_min: tuple[float, ...] = setting(
-        (), "ages at which `knots_mu` gives mu; empty: mu is constant", "min", at_least=0.0
+        (), "culture ages at which `knots_mu` gives mu; empty: mu is constant", "min", at_least=0.0
     )
     knots_mu: tuple[float, ...] = setting(
         (),
-        "mu at those ages, straight between them, the last one from there on; in place of `mu`",
+        "mu at those ages, with linear interpolation, constant after the last; replaces `mu`",
         "1/min",
         within=(0, 0.1),
     )
-    temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
+    temperature_law: str = setting("none", "temperature dependence of mu", choices=TEMPERATURE_LAWS)
     activation_kj_mol: float = setting(
         56.0,
-        "Ea of the Arrhenius law; 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
+        "activation energy (Arrhenius); 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
         "kJ/mol",
         within=(0, 150),
     )
     adaptation_min: float = setting(
         0.0,
-        "time constant with which growth follows temperature; at once within 21 to 37 degC (Ng et al. 1962)",
+        "time constant of growth after a change of temperature; 0 within 21 to 37 degC (Ng et al. 1962)",
         "min",
         within=(0, 120),
     )
     yield_od: float = setting(
-        math.inf, "OD grown from one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
+        math.inf, "OD produced by one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
     )
     k_s: float = setting(
-        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used when yield_od is finite", within=(1e-4, 1)
+        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used if yield_od is finite", within=(1e-4, 1)
     )
-    wall_attach_per_min: float = setting(0.0, "biomass that settles on the wall", "1/min", within=(0, 1e-2))
-    wall_growth_ratio: float = setting(0.0, "growth on the wall over growth in suspension", within=(0, 1))
-    wall_detach_per_min: float = setting(0.0, "biomass that leaves the wall", "1/min", within=(0, 0.1))
-    wall_capacity_od: float = setting(1.0, "OD-equivalent at which the wall is full", "OD", within=(1e-3, 10))
+    wall_attach_per_min: float = setting(0.0, "rate of attachment of biomass to the wall", "1/min", within=(0, 1e-2))
+    wall_growth_ratio: float = setting(0.0, "growth rate on the wall relative to suspension", within=(0, 1))
+    wall_detach_per_min: float = setting(0.0, "rate of detachment from the wall", "1/min", within=(0, 0.1))
+    wall_capacity_od: float = setting(1.0, "OD-equivalent of a full wall", "OD", within=(1e-3, 10))
 
     def __post_init__(self) -> None:
         check(self, "plant.growth")
@@ -80,12 +80,12 @@ class Culture:
       D    = fresh medium per minute / volume
 
     Args:
-      config: how cells grow; rngs: one stream per vial, for its growth rate.
+      config: growth; rngs: one stream per vial, for its growth rate.
       integrate: integrator.
-      second: another species beside that of `config`, S = 2; second_rngs: one stream per vial, for its draws.
-      pair: curves of both, where their temperature law is `pair`.
+      second: a second species, S = 2; second_rngs: one stream per vial, for its draws.
+      pair: curves of both, for `temperature_law=pair`.
     State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
-    and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle); and
+    and `stir_factor` (1 turning, 0 stopped; for a failed stirrer, not for the still phase of each cycle); and
     `species_factor`, (N, S).
     """
 
@@ -119,9 +119,9 @@ class Culture:
         self.species_factor = np.ones((self._n, len(species)))
 
     def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
-        """Start a new culture in balance with the medium it grew from.
+        """Start a new culture in balance with its medium.
 
-        Args: OD and degC, scalar or shape (N,). share: of the second species, as `od`; None = as drawn.
+        Args: OD and degC, scalar or shape (N,). share: share of B, as `od`; None: as drawn.
         """
         total = np.broadcast_to(od, (self._n,)).copy()
         shares = [total]
@@ -146,22 +146,22 @@ class Culture:
 
     @property
     def share(self) -> Array:
-        """x_2 / (x_1 + x_2), the share of the second species, shape (N,); nan where there is none, or no biomass."""
+        """Share of B, x_2 / (x_1 + x_2), shape (N,); nan without a second species or without biomass."""
         if len(self._responses) == 1:
             return np.full(self._n, np.nan)
         od = self.od
         return np.asarray(np.divide(self.biomass[:, 1], od, out=np.full(self._n, np.nan), where=od > 0.0))
 
     def new_minute(self, z: Array) -> None:
-        """Take this minute's draw: standard normal, shape (N,)."""
+        """Set the random draw of this minute: standard normal, shape (N,)."""
         self._log_drift = self._log_drift + self.config.drift_sd_per_h / np.sqrt(60.0) * z
 
     def dilute(self, kept: Array) -> None:
-        """Fresh medium left the share `kept`, shape (N,), of what was in the vial."""
+        """Dilute: fresh medium leaves the fraction `kept`, shape (N,), of the vial's content."""
         self.biomass, self.substrate = self.biomass * kept[:, None], 1.0 - (1.0 - self.substrate) * kept
 
     def concentrate(self, factor: Array) -> None:
-        """Water evaporated: concentrations rise by `factor`, shape (N,)."""
+        """Concentrate by evaporation: concentrations rise by `factor`, shape (N,)."""
         self.biomass, self.substrate = self.biomass * factor[:, None], self.substrate * factor
 
     def grow(self, minutes: float, dilution: Array, temperature: Array, age_min: Array) -> None:
@@ -191,11 +191,11 @@ class Culture:
         self.biomass, self.substrate, self._wall = state[:, :species], state[:, species], state[:, species + 1 :]
 
     def substeps(self, minutes: float) -> int:
-        """Integration steps in an interval of `minutes`."""
+        """Return the number of integration steps in `minutes`."""
         return max(1, int(np.ceil(minutes / SUBSTEP_MIN - 1e-9)))
 
     def rates(self, age_min: Array) -> Array:
-        """Specific growth rate of each species at this moment, 1/min, shape (N, S).
+        """Return the current specific growth rate of each species, 1/min, shape (N, S).
 
         Args: age_min: of the culture, min, shape (N,).
         """
@@ -216,11 +216,11 @@ class Culture:
         return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * factors)
 
     def settle(self, minutes: float) -> None:
-        """Cells sink where the stirrer stands still, and rise again where it turns."""
+        """Let cells sink without stirring, and rise again with it."""
         sunk = SETTLED_FRACTION * (1.0 - self.stir_factor)
         self._settled += (sunk - self._settled) * -np.expm1(-minutes / SETTLING_MIN)
 
     @property
     def in_light_path(self) -> Array:
-        """Suspended biomass that the sensor's light meets, OD, shape (N,)."""
+        """Return the suspended biomass in the light path of the sensor, OD, shape (N,)."""
         return self.od * (1.0 - self._settled)

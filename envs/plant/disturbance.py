@@ -1,4 +1,4 @@
-"""What happens to a plant beside its own terms: functions of one's own, called by name in every minute of its time."""
+"""Disturbances of a plant: your own functions, selected by name and called in every simulated minute."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,13 +14,13 @@ _known: dict[str, Disturbance] = {}
 
 
 def add(name: str, disturb: Disturbance) -> None:
-    """Make a disturbance known as `plant.disturbances=[NAME]`. Raises: ValueError for a name that is taken or empty."""
+    """Register a disturbance as `plant.disturbances=[NAME]`. Raises: ValueError for a used or empty name."""
     require(bool(name) and name not in _known, "disturbance", repr(name), "a name that is not taken")
     _known[name] = disturb
 
 
 def named(name: str) -> Disturbance:
-    """Find a disturbance by its name. Raises: ValueError naming those there are."""
+    """Return a disturbance by its name. Raises: ValueError with the known names."""
     allowed = f"{', '.join(_known)}" if _known else "none; extend=FILE.py brings them (docs/extending.md)"
     require(name in _known, "plant.disturbances", name, allowed)
     return _known[name]

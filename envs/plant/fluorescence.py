@@ -30,17 +30,17 @@ class FluorescenceConfig:
     """
 
     factor: tuple[float, float] = setting(
-        (1.0, 1.0), "k of a reactor is drawn uniformly between these", within=(0.1, 10), interval=True
+        (1.0, 1.0), "range of k, drawn uniformly per reactor", within=(0.1, 10), interval=True
     )
     offset: tuple[float, float] = setting(
-        (214.0, 214.0), "offset of a reactor, likewise", "counts", within=(0, 5000), interval=True
+        (214.0, 214.0), "range of the offset, drawn uniformly per reactor", "counts", within=(0, 5000), interval=True
     )
-    od_term: float = setting(150.0, "light that any cells scatter into the band", "counts/OD", within=(0, 5000))
+    od_term: float = setting(150.0, "light per OD that any cells scatter into the band", "counts/OD", within=(0, 5000))
     noise_sd: float = setting(30.0, "sd of a reading", "counts", within=(0, 1000))
     drift_per_day: float = setting(
-        0.0, "relative change of k per day is drawn uniformly in +- this", "1/day", within=(0, 0.5)
+        0.0, "largest relative drift of k, drawn uniformly in +- this", "1/day", within=(0, 0.5)
     )
-    ageing_per_day: float = setting(0.0, "relative loss of the lamp's light", "1/day", within=(0, 0.5))
+    ageing_per_day: float = setting(0.0, "relative loss of lamp light", "1/day", within=(0, 0.5))
     saturation: float = setting(
         FULL_SCALE, "highest reading, full scale of the converter", "counts", within=(100, FULL_SCALE)
     )

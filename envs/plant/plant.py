@@ -33,31 +33,27 @@ Array = NDArray[np.float64]
 class PlantConfig:
     """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else."""
 
-    growth: GrowthConfig = part(GrowthConfig, "how cells grow")
-    pump: PumpConfig = part(PumpConfig, "how a pump turns on-time into volume")
-    sensor: SensorConfig = part(SensorConfig, "what an averaged OD reading adds to the truth")
+    growth: GrowthConfig = part(GrowthConfig, "growth of the culture")
+    pump: PumpConfig = part(PumpConfig, "flow of the pumps")
+    sensor: SensorConfig = part(SensorConfig, "errors of an OD reading")
     vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
-    pair: PairConfig = part(PairConfig, "curves and pigment of two species, where temperature_law is pair")
+    pair: PairConfig = part(PairConfig, "curves and pigment of two species, for temperature_law=pair")
     thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
     second: SecondSpeciesConfig = part(SecondSpeciesConfig, "a second species in the vial")
-    fluorescence: FluorescenceConfig = part(FluorescenceConfig, "light that the second species gives, and its sensor")
-    start_od: float = setting(
-        0.5, "suspended biomass at reset unless the scenario says otherwise", "OD", within=(0, 10)
-    )
+    fluorescence: FluorescenceConfig = part(FluorescenceConfig, "fluorescence of the second species, and its sensor")
+    start_od: float = setting(0.5, "OD at reset unless the scenario sets it", "OD", within=(0, 10))
     start_temperature: float = setting(
-        37.0, "of vial and thermostat at reset unless somebody says otherwise", "degC", within=(0, 60)
+        37.0, "temperature of vial and thermostat at reset unless the scenario sets it", "degC", within=(0, 60)
     )
-    start_min: float = setting(
-        0.0, "age of culture and pump at reset, from which their drifts and knots go on", "min", at_least=0.0
-    )
+    start_min: float = setting(0.0, "age of culture and pump at reset, for drifts and knots", "min", at_least=0.0)
     start_spread_min: float = setting(
         0.0,
-        "each vial is older by a uniform draw from 0 to this, so that vials meet different hours",
+        "each vial is older by a uniform draw from 0 to this",
         "min",
         at_least=0.0,
     )
-    disturbances: tuple[str, ...] = setting((), "functions of one's own that act on the vials every minute, by name")
-    integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
+    disturbances: tuple[str, ...] = setting((), "your own functions that act on the vials every minute, by name")
+    integrator: str = setting("euler", "integration scheme of the mass balances", choices=tuple(INTEGRATORS))
 
     def __post_init__(self) -> None:
         check(self, "plant")

@@ -26,33 +26,33 @@ class PumpConfig:
 
     dosing: str = setting("continuous", "when the dose of an interval flows", choices=("continuous", "pulse"))
     gain_ml_s: float = setting(1.0, "mean flow at full power (vendor: up to 1)", "mL/s", within=(0.05, 5))
-    gain_cv: float = setting(0.0, "its relative spread between heads", within=(0, 0.3))
-    gain_drift_per_h: float = setting(0.0, "relative change of the flow (tube wear)", "1/h", within=(-0.2, 0.2))
+    gain_cv: float = setting(0.0, "relative spread of the flow between pump heads", within=(0, 0.3))
+    gain_drift_per_h: float = setting(0.0, "relative drift of the flow (tube wear)", "1/h", within=(-0.2, 0.2))
     knots_min: tuple[float, ...] = setting(
-        (), "ages at which `knots_ml_s` gives the flow; empty: it is constant", "min", at_least=0.0
+        (), "pump ages at which `knots_ml_s` gives the flow; empty: constant", "min", at_least=0.0
     )
     knots_ml_s: tuple[float, ...] = setting(
         (),
-        "mean flow at full power at those ages, straight between them, the last one from there on; in place of "
+        "mean flow at full power at those ages, with linear interpolation, constant after the last; replaces "
         "`gain_ml_s`",
         "mL/s",
         within=(0.05, 5),
     )
-    pulse_cv: float = setting(0.0, "relative spread of a minute's dose", within=(0, 1))
-    pulse_ar: float = setting(0.0, "its correlation with the minute before", within=(0, 0.95))
-    dead_time_s: float = setting(0.0, "start of each pulse that delivers nothing", "s", within=(0, 0.5))
-    min_pulse_s: float = setting(0.0, "pulses shorter than this deliver nothing", "s", within=(0, 1))
+    pulse_cv: float = setting(0.0, "relative spread of the dose of a minute", within=(0, 1))
+    pulse_ar: float = setting(0.0, "correlation of that spread from minute to minute", within=(0, 0.95))
+    dead_time_s: float = setting(0.0, "initial part of each pulse that delivers nothing", "s", within=(0, 0.5))
+    min_pulse_s: float = setting(0.0, "shorter pulses deliver nothing", "s", within=(0, 1))
     timing_error_s: float = setting(
-        0.0, "each pulse lasts longer by a uniform draw from 0 to this", "s", within=(0, 0.5)
+        0.0, "largest extra duration of a pulse, drawn uniformly from 0", "s", within=(0, 0.5)
     )
-    prime_low: float = setting(1.0, "fraction that the priming pulse delivers, lowest", within=(0, 1))
-    prime_high: float = setting(1.0, "and highest", within=(0, 1))
+    prime_low: float = setting(1.0, "smallest fraction that the first pulse after a pause delivers", within=(0, 1))
+    prime_high: float = setting(1.0, "largest fraction that the first pulse after a pause delivers", within=(0, 1))
     waste_ml_s: float = setting(1.0, "flow of the waste pump at full power (vendor)", "mL/s", within=(0.05, 5))
     overflow_ml_s: float = setting(
-        1.0, "flow of the overflow pump at full power, if there is one (vendor)", "mL/s", within=(0.05, 5)
+        1.0, "flow of the overflow pump at full power, if present (vendor)", "mL/s", within=(0.05, 5)
     )
     back_leak_ml: float = setting(
-        0.0, "siphoned back after each pulse, 0.02 to 0.2 on a leaking head", "mL", within=(0, 1)
+        0.0, "volume that flows back after each pulse, 0.02 to 0.2 with a leaking head", "mL", within=(0, 1)
     )
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ class ThermalConfig:
     medium_c: float = setting(24.0, "temperature of fresh medium", "degC", within=(0, 45))
     ripple_c: float = setting(0.0, "sd of the temperature reading", "degC", within=(0, 2))
     offset_c: tuple[float, float] = setting(
-        (0.0, 0.0), "measured less true temperature, drawn once per vial between these", "degC", within=(-3, 3),
+        (0.0, 0.0), "range of measured minus true temperature, drawn once per vial", "degC", within=(-3, 3),
         interval=True,
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The vial as a vessel: what flows in and out, where the level ends, what evaporates."""
+"""The vial as a vessel: inflow, outflow, level, evaporation."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ __all__ = ["Vessel", "VesselConfig"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrations finite
+MIN_VOLUME_ML = 1.0  # mL that no pump can remove; keeps concentrations finite
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,17 @@ class VesselConfig:
     """The vial and its bottle."""
 
     volume_ml: float | None = setting(
-        None, "mean culture up to the waste tube, where it differs from the bench's on purpose", "mL", within=(5, 50)
+        None, "mean culture volume up to the waste tube, if it should differ from the bench's", "mL", within=(5, 50)
     )
-    volume_sd_ml: float = setting(0.0, "spread of the tube's height between vials", "mL", within=(0, 1.5))
+    volume_sd_ml: float = setting(0.0, "sd of that volume between vials", "mL", within=(0, 1.5))
     overflow_above_ml: float = setting(
-        2.0, "the overflow pump's tube ends so far above the waste tube", "mL", within=(0, 10)
+        2.0, "height of the overflow pump's tube above the waste tube, as volume", "mL", within=(0, 10)
     )
     capacity_ml: float | None = setting(
-        None, "overflows above; null: a vial of 30 mL, or 10 mL above the waste tube where that is more", "mL",
+        None, "volume at which the vial overflows; null: 30 mL, or 10 mL above the waste tube if that is more", "mL",
         at_most=200.0,
     )  # fmt: skip
-    evaporation_ml_day: float = setting(0.0, "water lost", "mL/day", within=(0, 50))
+    evaporation_ml_day: float = setting(0.0, "evaporation of water", "mL/day", within=(0, 50))
     media_ml: float = setting(math.inf, "fresh medium in the bottle; inf: never empty", "mL", within=(0, math.inf))
 
     def __post_init__(self) -> None:
@@ -48,9 +48,9 @@ class VesselConfig:
         require(enough, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
 
     def of(self, bench_ml: Array) -> Array:
-        """Mean culture of each vial, mL, (N,); `bench_ml` unless the config differs.
+        """Return the mean culture volume of each vial, mL, (N,); `bench_ml` unless the config sets it.
 
-        Raises: ValueError for more than the vial holds.
+        Raises: ValueError for more than the capacity.
         """
         mean = bench_ml if self.volume_ml is None else np.full(len(bench_ml), self.volume_ml)
         self._holds(float(mean.max()))
@@ -58,16 +58,16 @@ class VesselConfig:
 
 
 class Vessel:
-    """N vials that liquid leaves through outlets at a height.
+    """N vials with outlets at fixed heights.
 
-    The waste pump lowers the level to its tube, never below; what it does not take raises the level up to the rim,
-    where `overflowed` is set. An overflow pump is a second such outlet a little higher.
+    The waste pump lowers the level to its tube, never below. The rest raises the level up to the rim, where
+    `overflowed` is set. An overflow pump is a second such outlet a little higher.
 
     Args:
       config: heights and evaporation; pump: flows of the waste pump and of the overflow pump.
-      rngs: one stream per vial, for the height of its tube. bench_ml: what the bench says of the volume, mL, (N,).
+      rngs: one stream per vial, for the height of its tube. bench_ml: volume of the bench, mL, (N,).
     State, shape (N,): `volume_ml`, `overflowed`. Fault switches, shape (N,): `waste_gain_factor` and
-    `overflow_gain_factor`, 0 blocked, 1 sound.
+    `overflow_gain_factor`, 0 blocked, 1 normal.
     """
 
     def __init__(self, config: VesselConfig, pump: PumpConfig, rngs: Streams, bench_ml: Array) -> None:
@@ -86,15 +86,16 @@ class Vessel:
         self.overflowed: Mask = np.zeros(self._tube_ml.size, dtype=bool)
 
     def exchange(self, fresh: Array, waste_s: Array, overflow_s: Array) -> Array:
-        """Move liquid; returns F, the share of what was in the vial that its concentrations keep, shape (N,).
+        """Move liquid; return the factor F of the concentrations of the old content, shape (N,).
 
-        Fresh medium fills the vial up to an outlet's tube, is exchanged there for what its pump takes, and rises on.
+        Fresh medium fills the vial up to an outlet's tube, replaces there the volume that its pump removes, then rises
+        on.
 
         Args:
           fresh: fresh medium, mL, shape (N,). waste_s, overflow_s: on-times of the two pumps, s, shape (N,).
         """
         above_ml = self._tube_ml + self.config.overflow_above_ml
-        outlets = [  # from below: level of the tube, mL the pump is able to move
+        outlets = [  # from below: level of the tube, volume that the pump can move in mL
             [self._tube_ml, _moved(waste_s, self._pump.waste_ml_s * self.waste_gain_factor)],
             [above_ml, _moved(overflow_s, self._pump.overflow_ml_s * self.overflow_gain_factor)],
         ]
@@ -114,17 +115,17 @@ class Vessel:
         return np.asarray(kept)
 
     def draw_out(self, volume_ml: Array) -> None:
-        """Take culture out from below, mL, shape (N,)."""
+        """Remove culture from below, mL, shape (N,)."""
         self.volume_ml = np.maximum(self.volume_ml - volume_ml, MIN_VOLUME_ML)
 
     def evaporate(self, minutes: float) -> Array:
-        """Lose water; returns by how much that concentrates the culture, >= 1, shape (N,)."""
+        """Evaporate water; return the factor of the concentrations, >= 1, shape (N,)."""
         before = self.volume_ml
         self.draw_out(np.asarray(self.config.evaporation_ml_day * minutes / 1440.0))
         return np.asarray(before / self.volume_ml)
 
 
 def _moved(on_s: Array, flow: Array) -> Array:
-    """Volume a pump of `flow` mL/s could move, mL, shape (N,): nothing backwards, nothing if it is blocked."""
-    able = np.zeros_like(flow)  # a blocked pump moves nothing, however long it runs (0 times infinity is 0 here)
+    """Return the volume that a pump of `flow` mL/s can move, mL, shape (N,): never negative, 0 if blocked."""
+    able = np.zeros_like(flow)  # a blocked pump moves nothing for any on-time (0 times infinity is 0 here)
     return np.multiply(np.maximum(on_s, 0.0), flow, out=able, where=flow > 0.0)

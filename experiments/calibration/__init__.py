@@ -1,4 +1,4 @@
-"""What `calibrate` does around the estimate: its config, its report, the study of its intervals.
+"""Parts of `calibrate` besides the estimate: config, report, study of the intervals.
 
-May be entered by the command alone.
+Only the command may import it.
 """

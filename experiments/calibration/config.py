@@ -14,44 +14,44 @@ LAWS = ("open_loop", "pi", "pi_tuned", "threshold", "proportional")
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """A recording and how it is fitted; or the generator of recordings; or the study of the intervals' coverage."""
+    """Config of a calibration, of the generator of recordings, or of the study of the intervals' coverage."""
 
-    data: str | None = setting(None, "recording (CSV); null: the synthetic one that the project ships")
-    rows: str | None = setting(None, "FIRST:END, data rows counted from 0, END excluded; null: all")
-    run: int | None = setting(None, "which of several concatenated runs, from 0; null: the longest")
-    reactor: str | None = setting(None, "which reactor of a file with a column `reactor`; null: the first")
+    data: str | None = setting(None, "recording (CSV); null: the simulated recording of the project")
+    rows: str | None = setting(None, "FIRST:END, data rows from 0, without END; null: all")
+    run: int | None = setting(None, "run in a file of several concatenated runs, from 0; null: the longest")
+    reactor: str | None = setting(None, "reactor in a file with a column `reactor`; null: the first")
     pump_ml_s: float = setting(
         1.0,
-        "flow of the Chi.Bio's feed pump at full power (its own CSV holds duties, not flows)",
+        "flow of the Chi.Bio's feed pump at full power (its CSV has duties, not flows)",
         "mL/s",
         above=0.0,
         at_most=10.0,
     )
-    name: str = setting("calibrated", "the environment file is RUN/<name>.yaml")
+    name: str = setting("calibrated", "name of the environment file RUN/<name>.yaml")
     pumps: tuple[int, ...] = setting(
-        (1,), "pumps of the Chi.Bio's own CSV that feed the vial (1 to 4); their flows add up", within=(1, 4), some=True
+        (1,), "pumps in the Chi.Bio's CSV that feed the vial (1 to 4); their flows are added", within=(1, 4), some=True
     )
-    identify: IdentifyConfig = part(IdentifyConfig, "how mu and tau are estimated and what is reported")
+    identify: IdentifyConfig = part(IdentifyConfig, "estimation of mu and tau")
     generate: bool = setting(False, "simulate the paper's open-loop protocol and write it as a recording")
-    out: str | None = setting(None, "where to; null: RUN/LAW.csv")
+    out: str | None = setting(None, "path of that recording; null: RUN/LAW.csv")
     coverage: int = setting(
         0,
-        "simulate so many recordings and count how often the 95 % intervals hold the truth; 0: no study",
+        "number of simulated recordings, to count how often the 95 % intervals contain the true values; 0: no study",
         within=(0, 10000),
     )
     law: str = setting(
         "open_loop",
-        "what moves the pump of a simulated recording: the paper's protocol, the device's PI, a tuned one, an on-off "
-        "threshold, or a proportional answer to each reading, which hides tau",
+        "pump control of a simulated recording: the paper's open-loop protocol, the device's PI, a tuned PI, an on-off "
+        "threshold, or a proportional controller, which hides tau",
         choices=LAWS,
     )
     setpoints: tuple[float, ...] = setting(
-        (0.5,), "of a law that regulates, each for an equal part of the recording", "OD", within=(0.05, 2), some=True
+        (0.5,), "setpoints of a feedback controller, in equal parts", "OD", within=(0.05, 2), some=True
     )
     rest_min: float = setting(
-        0.0, "the pump of a law that regulates rests so long at the start of every hour", "min", within=(0, 50)
+        0.0, "pause of the pump at the start of every hour, for a feedback controller", "min", within=(0, 50)
     )
-    gain: float = setting(0.1, "of law=proportional", "mL/s per OD", within=(0, 1))
+    gain: float = setting(0.1, "gain of law=proportional", "mL/s per OD", within=(0, 1))
     protocol: OpenLoop = part(OpenLoop, "protocol, culture and sensor of a simulated recording")
 
     def __post_init__(self) -> None:

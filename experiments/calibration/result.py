@@ -1,4 +1,4 @@
-"""What a calibration leaves behind in words and numbers: summary.json, environment file, report on the console."""
+"""Output of a calibration: summary.json, environment file, report on the console."""
 
 from dataclasses import asdict
 from typing import Any
@@ -63,9 +63,9 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
 
 
 def refusal(error: NotIdentifiable, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
-    """Build the line that ends a refused calibration, and its summary.json.
+    """Build the message and the summary.json of a refused calibration.
 
-    A doubt about the recording comes first: who counts the wrong pump has nothing else to record.
+    A fault of the recording comes first, e.g. a wrong pump.
     """
     what, then = recording.doubts[0] if recording.doubts else ("", error.remedy)
     verdict = Verdict("record again" if not what else "read again", "; ".join(filter(None, (what, error.why))), then)
@@ -116,7 +116,7 @@ def _drift(d: Drift | None) -> dict[str, Any] | None:
 def environment_yaml(result: Calibration, source: str) -> str:
     """Write the environment with the fitted mu and tau, the meaning of every value, and the source of the two.
 
-    Raises: ValueError naming the value that no environment may have.
+    Raises: ValueError with the value that is out of range for an environment.
     """
     model = EnvConfig(mu=result.mu.value, tau=result.tau.value)
     mu, tau = result.mu, result.tau

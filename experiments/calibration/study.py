@@ -1,4 +1,4 @@
-"""Simulated recordings under any law, and how often the intervals of their calibrations hold the truth."""
+"""Simulated recordings under any controller, and the coverage of the intervals of their calibrations."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +26,7 @@ Fitted = Calibration | str
 
 
 def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Array]:
-    """Simulate n recordings under the configured law: time (T,), OD and pump rate (n, T), mean growth rate (n,)."""
+    """Simulate n recordings: time (T,), OD and pump rate (n, T), mean growth rate (n,)."""
     protocol, rng = config.protocol, np.random.default_rng(config.protocol.seed)
     if config.law == "open_loop":
         return recordings(protocol, OpenLoopLaw(protocol, n, rng).decide, rng, n)
@@ -35,7 +35,7 @@ def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Arr
 
 
 def _regulation(config: CalibrateConfig, n: int) -> Decide:
-    """Build the law as (minute, readings) -> rates; setpoints share the recording's time."""
+    """Build the controller as (minute, readings) -> rates; each setpoint gets an equal part of the recording."""
     times = np.linspace(0.0, 60.0 * config.protocol.hours, len(config.setpoints) + 1)[1:-1]
     everyone = np.ones(n, dtype=np.bool_)
     if config.law == "proportional":
@@ -56,7 +56,7 @@ def _setpoint(config: CalibrateConfig, times: Array, t: float) -> float:
 
 
 def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar: bool = False) -> list[Fitted]:
-    """Calibrate each of N recordings, (T,) and (N, T); a refusal in words where there is no pair."""
+    """Calibrate each of N recordings, (T,) and (N, T); or the message of a refusal."""
     found: list[Fitted] = []
     for i in tqdm(range(len(od)), disable=None if bar else True):
         try:
@@ -67,10 +67,10 @@ def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar
 
 
 def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, Any]:
-    """How N calibrations do against their truth, (N,) each: what is accepted, and of that the share held, in %.
+    """Compare N calibrations with the true values, (N,) each: accepted, and of those the coverage, in %.
 
-    mu is compared with the mean growth rate over the recording's rows, which differs from draw to draw where growth
-    wanders. wrong_pct: accepted, and the truth is not even within twice the interval, of all.
+    mu is compared with the mean growth rate over the recording's rows, which differs between draws if growth
+    fluctuates. wrong_pct: accepted although the true value is beyond twice the interval, of all.
     """
     kept = [i for i, c in enumerate(found) if isinstance(c, Calibration)]
     refusals = sorted({c for c in found if isinstance(c, str)})
@@ -85,7 +85,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
 
 
 def coverage(config: CalibrateConfig, folder: Path) -> float:
-    """Share of simulated recordings whose 95 % intervals hold the truth; returns the smaller of the two, in %."""
+    """Return the smaller of the coverages of mu and tau by their 95 % intervals, over simulated recordings, in %."""
     protocol, n = config.protocol, config.coverage
     title = f"{n} simulated recordings of {protocol.hours:g} h under {config.law}, {100 * protocol.noise:g} % noise"
     print(title, flush=True)
@@ -115,19 +115,19 @@ def coverage(config: CalibrateConfig, folder: Path) -> float:
 
 
 def _intervals(found: list[Fitted], name: str) -> Array:
-    """(value, low, high) of each that was accepted, shape (n, 3)."""
+    """Return (value, low, high) of each accepted calibration, shape (n, 3)."""
     chosen = [getattr(c, name) for c in found if isinstance(c, Calibration)]
     return np.array([(p.value, p.low, p.high) for p in chosen])
 
 
 def _holds(values: Array, truth: Array, times: float = 1.0) -> Mask:
-    """Whether intervals, each end so many times as far from its value, hold the truth."""
+    """Return whether intervals, widened by a factor, contain the true value."""
     value, low, high = values.T
     return np.asarray((value - times * (value - low) <= truth) & (truth <= value + times * (high - value)))
 
 
 def _judged(values: Array, truth: Array) -> dict[str, float]:
-    """(value, low, high) of each draw, shape (n, 3), against its truth, shape (n,)."""
+    """Compare (value, low, high) of each draw, shape (n, 3), with its true value, shape (n,)."""
     return {
         "coverage_pct": 100.0 * float(np.mean(_holds(values, truth))),
         "median_bias_pct": 100.0 * float(np.median(values[:, 0] / truth) - 1.0),

@@ -1,4 +1,4 @@
-"""twin.yaml: the plant behind a recording, as a preset of conf/plant would say it, with the bands beside the values."""
+"""twin.yaml: the plant behind a recording, in the form of a preset of conf/plant, with bands beside the values."""
 
 from dataclasses import replace
 from textwrap import wrap
@@ -28,8 +28,8 @@ LEFT = (
 
 
 def plant_of(found: Twin) -> PlantConfig:
-    """Convert the twin to a plant. Raises: ValueError naming the value that no plant may have."""
-    volume = Bench.volume_ml  # flow and volume are one number to a recording: both stand in the file
+    """Convert the twin to a plant. Raises: ValueError with the value that is out of range for a plant."""
+    volume = Bench.volume_ml  # a recording determines only flow over volume: the file has both
     flow, knots = volume / (60.0 * found.tau.value), _numbers(found.knot_min)
     growth = GrowthConfig(mu=_mean(found.mu.value), knots_min=knots, knots_mu=_numbers(found.mu.value))
     pump = PumpConfig(dosing="pulse", gain_ml_s=_mean(flow), pulse_cv=_rounded(found.noise.dose_cv))
@@ -46,7 +46,7 @@ def plant_of(found: Twin) -> PlantConfig:
 
 
 def twin_yaml(found: Twin, source: str) -> str:
-    """Write the file's text: what differs from a plant's defaults, each value with its meaning and unit.
+    """Write the file's text: all values that differ from a plant's defaults, with meaning and unit.
 
     Raises: ValueError naming the value that no plant may have.
     """

@@ -1,4 +1,4 @@
-"""A certificate of a learned policy: the band that its closed loop enters and never leaves, proven for every setpoint.
+"""A certificate of a learned policy: the proven band that its closed loop enters and never leaves, for every setpoint.
 
-Numerics are pure: a network cut into polygons, images of intervals, a verdict. No proof rests on a sample.
+Numerics are pure: polygons of a network, images of intervals, a verdict. No proof depends on samples.
 """

@@ -1,4 +1,4 @@
-"""Within which errors of an estimator a policy that sees (error, growth share) is proven; what a supervisor watches."""
+"""Bounds of the estimator's errors for which a policy of (error, growth share) is proven, for the supervisor."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 class EstimateBounds:
     """Bounds on the errors of the estimates of e = ln(x/r)/B and s = mu h / B (envs/relative.py).
 
-    full_pump: B, what one period of full pump takes off ln x, of the model that was certified.
-    error: smallest bound of e's error. od: bound of the OD estimate's error, OD, which rules at a low OD.
+    full_pump: B, the decrease of ln x in one period at full pump rate, of the certified model.
+    error: smallest bound of e's error. od: bound of the OD estimate's error, OD, the larger bound at a low OD.
     growth_share: bound of s's error. gain: relative error of a dose's effect.
     proven: range of s within which the band is proven. setpoints: likewise, OD.
     """
@@ -42,10 +42,10 @@ class EstimateBounds:
         return self.error_bound(setpoint * np.exp(self.full_pump * estimate))
 
     def estimate(self, e: Array, side: Array, setpoint: float | None) -> Array:
-        """Find the farthest estimate to the side (1: above, -1: below) that e allows, (N,); inverts `error_at`.
+        """Return the farthest possible estimate of e on a side (1: above, -1: below), (N,); the inverse of `error_at`.
 
         With c the error of the OD and x = r exp(B e): above, ln(y) - ln(1 + c/y) = ln(x) gives y = (x + sqrt(x^2 +
-        4 c x)) / 2; below, y + c = x. Where the constant bound is the larger one, it counts.
+        4 c x)) / 2; below, y + c = x. If the constant bound is larger, it applies.
         """
         far = e + side * self.error
         if setpoint is None:
@@ -57,7 +57,7 @@ class EstimateBounds:
         return np.asarray(np.where(side > 0, np.maximum(far, by_od), np.minimum(far, by_od)))
 
     def hold(self, od: Array, error: Array, growth_share: Array, share_error: Array) -> NDArray[np.bool_]:
-        """Whether errors of these sizes, of e and of s, are within the bounds at this OD and this s; all (N,).
+        """Return whether errors of e and s are within the bounds at this OD and this s; all (N,).
 
         nan is never within.
         """
@@ -67,7 +67,7 @@ class EstimateBounds:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> "EstimateBounds":
-        """From a certificate. Raises: KeyError, TypeError, ValueError for damaged ones."""
+        """Read the bounds of a certificate. Raises: KeyError, TypeError, ValueError for a damaged one."""
         numbers = (float(values[key]) for key in ("full_pump", "error", "od", "growth_share", "gain"))
         pairs = ((float(low), float(high)) for low, high in (values["proven"], values["setpoints"]))
         found = cls(*numbers, *pairs)  # type: ignore[arg-type]

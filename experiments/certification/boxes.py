@@ -1,4 +1,4 @@
-"""Two other ways to what polygons say of a policy: bounds over small rectangles, and intervals along lines."""
+"""Independent checks of the polygons of a policy: bounds over small rectangles, and intervals along lines."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ __all__ = ["contradictions", "on_lines", "possible"]
 
 
 def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Actions that may be best in boxes with corners low, high (N, 2); shape (N, A).
+    """Find the actions that may be best in boxes with corners low, high (N, 2); shape (N, A).
 
     Each unit is an affine form, centre + slopes . (offset in the box) +- rest: a zonotope of two generators and a box.
     A relu that changes its sign on [l, u] becomes its chord's slope u / (u - l) with a rest of -l u / (2 (u - l)).
@@ -34,9 +34,9 @@ def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
 
 
 def contradictions(network: Network, regions: Regions, grid: tuple[int, int]) -> int:
-    """Corners of polygons whose action the bound of their box excludes, over a grid of boxes that covers all polygons.
+    """Count corners of polygons whose action the bound of their box excludes, over a grid of boxes on all polygons.
 
-    Also counted: polygons that leave a part of the rectangle out, or overlap, as one.
+    Gaps or overlaps of the polygons count as one more.
     """
     corner = regions.edges[:, 0]
     low, high = corner.min(axis=0), corner.max(axis=0)
@@ -54,7 +54,7 @@ def contradictions(network: Network, regions: Regions, grid: tuple[int, int]) ->
 
 
 def _knots(network: Network, low: float, high: float, second: float) -> tuple[Array, Array]:
-    """Points of the line between which the network is linear, (K, 2), and Q at them, (K, A)."""
+    """Find the points of a line between which the network is linear, (K, 2), and Q at them, (K, A)."""
     points = np.array([[low, second], [high, second]])
     layers = network.hidden
     for depth in range(len(layers)):
@@ -70,7 +70,7 @@ def _knots(network: Network, low: float, high: float, second: float) -> tuple[Ar
 
 
 def _along(network: Network, low: float, high: float, second: float) -> tuple[Array, Index]:
-    """Intervals of the first coordinate in which single precision may choose an action: [low, high], (P, 2); which."""
+    """Find intervals of the first coordinate, (P, 2), in which float32 may choose an action, and the action."""
     points, q = _knots(network, low, high, second)
     slack = rounding(network, points)
     slack = np.maximum(slack[:-1], slack[1:])
@@ -88,7 +88,7 @@ def _along(network: Network, low: float, high: float, second: float) -> tuple[Ar
 def on_lines(network: Network, first: tuple[float, float], seconds: Array) -> tuple[Points, Index]:
     """Replace `partition` and `points_in_strips` for strips without width: lines of constant second coordinate (S,).
 
-    Returns: the two ends of every interval, whose number stands as their `polygon`; each interval's action.
+    Returns: the two ends of every interval, with its number as `polygon`; each interval's action.
     """
     found = [_along(network, *first, float(second)) for second in seconds]
     ends, action = (np.concatenate(parts) for parts in zip(*found, strict=True))

@@ -1,4 +1,4 @@
-"""The file of a certificate: what it holds, where it lies, and what a device concludes from it."""
+"""The file of a certificate: its content, its place, and the conclusions of a device."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -30,17 +30,17 @@ class FormatError(ValueError):
 
 
 def beside(policy: Path) -> Path:
-    """Where the certificate of a policy file lies: certificate.json for policy.npz, else NAME.certificate.json."""
+    """Return the path of a policy file's certificate: certificate.json for policy.npz, else NAME.certificate.json."""
     return policy.with_name("certificate.json" if policy.stem == "policy" else f"{policy.stem}.certificate.json")
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A certificate as it was read: what it is of, what was asked, and what failed.
+    """A certificate as read: its policy, its question, and its failures.
 
-    of: what decides, by name: fingerprints of the parts of a policy, and the settings that act beside it.
+    of: by name, fingerprints of the parts of a policy, and the other settings that affect the loop.
     safe: every requirement of safety is met. passed: every requirement is met. failed: the requirements that are not.
-    setpoints: lowest and highest that it speaks of, OD. bounds: of an estimator's errors, and its growth shares.
+    setpoints: lowest and highest that it covers, OD. bounds: of an estimator's errors, and its growth shares.
     """
 
     of: Mapping[str, Any]
@@ -52,7 +52,7 @@ class Stored:
     bounds: EstimateBounds | None
 
     def differs(self, policy: Policy, settings: Mapping[str, Any]) -> list[str]:
-        """Every part of a policy, and every setting, that is another than the one it was made for."""
+        """List every part of a policy and every setting that differs from the certified one."""
         parts, given = fingerprints(policy), {**fingerprints(policy), **settings}
         names = [name for name in sorted({*given, *self.of}) if given.get(name) != self.of.get(name)]
         shown = {name: f"{name} = {given.get(name)}, certified {self.of.get(name)}" for name in names}
@@ -60,7 +60,7 @@ class Stored:
 
 
 def _up(value: Array, digits: float = 1e6) -> Array:
-    """Round up, so that the written number holds as well."""
+    """Round up, so that the written number is still a bound."""
     return np.asarray(np.ceil(value * digits) / digits)
 
 
@@ -79,14 +79,14 @@ def _case(proof: Proof) -> dict[str, Any]:
 
 
 def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, found: Certificate) -> dict[str, Any]:
-    """Build a certificate as it is written.
+    """Build the content of a certificate's file.
 
     `band` is in ln(x / r) of a policy that sees the OD, else in e. `strips`: lowest and highest setpoint or growth
-    share, and into how many equal strips it is cut; columns have an entry per strip.
-    `cases`: those that are drawn; of all others `checks` have the worst.
+    share, and the number of equal strips; columns have an entry per strip.
+    `cases`: those in the figure; `checks` have the worst of all others.
 
-    Args: settings: that decide beside the policy. config: with the nominal model in `env`, so that whoever reads it
-      proves the same.
+    Args: settings: other settings that affect the loop. config: with the nominal model in `env`, so that a reader can
+    repeat the proof.
     """
     asked = found.question
     return {
@@ -129,7 +129,7 @@ def load(path: Path) -> Stored:
 
 
 def _check(given: Mapping[str, Any]) -> Requirement:
-    """Read a requirement, whose value is null where it was no finite number. Raises: ValueError, KeyError."""
+    """Read a requirement; its value is null if it was not finite. Raises: ValueError, KeyError."""
     name, where, kind = (str(given[key]) for key in ("name", "where", "kind"))
     if kind not in KINDS:
         raise ValueError(f"kind {kind} of a requirement: allowed {', '.join(KINDS)}")
@@ -139,9 +139,9 @@ def _check(given: Mapping[str, Any]) -> Requirement:
 
 
 def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
-    """Within which errors of its estimator a policy may act; None without a certificate of it that says it is safe.
+    """Return the estimator's error bounds for which a policy may act; None without a certificate of safety.
 
-    Args: settings: that decide beside the policy. file: of the policy, beside which its certificate lies. model: tau,
+    Args: settings: other settings that affect the loop. file: of the policy, beside its certificate. model: tau,
     control period and largest pump rate of the run.
     """
     try:
@@ -155,9 +155,9 @@ def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvCo
 
 @dataclass(frozen=True)
 class Opinion:
-    """What a device concludes from a certificate.
+    """Conclusions of a device from a certificate.
 
-    refused: reasons not to let the policy pump, each with its remedy. short: performance that falls short, each with
+    refused: reasons to refuse the policy, each with its remedy. short: performance requirements that fail, each with
     number, limit and remedy; no reason to refuse.
     """
 
@@ -174,13 +174,12 @@ def judged(
     model: EnvConfig,
     name: str,
 ) -> Opinion:
-    """Judge a policy by its certificate: refuse for safety, tell what its performance lacks.
+    """Judge a policy by its certificate: refuse for safety, report missing performance.
 
-    It is proven anew for the setpoints and the bench of the run: another bench is no reason by itself.
+    It is proven again for the setpoints and the bench of the run; a different bench alone is no reason to refuse.
 
-    Args: settings: that decide beside the policy. file: of the policy, beside which the certificate lies. setpoints:
-    those of the run, OD. model: tau, control period and largest pump rate of the run. name: what the user calls the
-    policy.
+    Args: settings: other settings that affect the loop. file: of the policy, beside its certificate. setpoints: of the
+    run, OD. model: tau, control period and largest pump rate of the run. name: the user's name of the policy.
     """
     path, remedy = beside(file), f"python -m experiments.certify policy={name}"
     if name == "shipped":
@@ -235,7 +234,8 @@ def _unfit(
 def _other_pump(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> str:
     """Return why a policy of the OD does not suit the pump of a run, with the remedy; "" where it does.
 
-    It is proven for a tau within `uncertainty` of the one that it was trained for; one of relative coordinates for any.
+    A policy of the OD is proven for a tau within `uncertainty` of its training's; a policy of relative coordinates for
+    any.
     """
     if policy.observation == RELATIVE:
         return ""
@@ -254,7 +254,7 @@ def _listed(checks: Sequence[Requirement]) -> str:
 
 
 def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
-    """Return what performance lacks, and limits of it that the certificate set wider than by default."""
+    """Return missing performance, and performance limits that are wider than the default."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
     if laxer := stored.config.laxer_performance():
@@ -263,9 +263,9 @@ def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
 
 
 def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:
-    """Ask the questions of a certificate for the bench of a run.
+    """Adapt the question of a certificate to the bench of a run.
 
-    A policy of (error, growth share) meets another B; the nominal model of one of the OD has another volume.
+    For a policy of (error, growth share) B changes; for a policy of the OD the volume of the nominal model.
     """
     if policy.observation == RELATIVE:
         return replace(config, bench=bench, env=model, full_pumps=())

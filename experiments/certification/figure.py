@@ -1,4 +1,4 @@
-"""The figure of a certificate: bands, entry times, low doses, and the polygons that they follow from."""
+"""The figure of a certificate: bands, entry times, low doses, and the underlying polygons."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +12,7 @@ __all__ = ["figure"]
 
 
 def figure(found: Certificate) -> Figure:
-    """Four panels over the setpoint (or the growth share)."""
+    """Draw four panels over the setpoint (or the growth share)."""
     made, (polygons, widths, entries, doses) = new_figure(11.0, 7.0, 2, 2)
     _polygons(polygons, found)
     asked = found.question

@@ -1,7 +1,7 @@
-"""Sets of states as intervals: where each action may be chosen, and what a control period makes of them.
+"""Sets of states as intervals: where each action may be chosen, and their image after a control period.
 
-The state is one number d per strip of setpoints, and an action only shifts it: d' = d + shift(action). An interval of
-states has an interval as image, however many actions its states may meet.
+The state is one number d per strip of setpoints, and an action only shifts it: d' = d + shift(action). The image of an
+interval is an interval, for any number of possible actions.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,10 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 States = Callable[[Array, Array], tuple[Array, Array]]
 
-OUTWARD = 1e-12  # every image is wider by this much: more than double precision loses in adding
-ENTERED = 1e-9  # as close to the limit as this counts as inside
+OUTWARD = 1e-12  # every image is wider by this, which is more than the rounding error
+ENTERED = 1e-9  # tolerance of being inside a limit
 MAX_IMAGES = 10_000
-SAME = 1e-12  # corners closer than this are one corner
+SAME = 1e-12  # corners closer than this are merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Pieces:
 
     @classmethod
     def of(cls, strip: Index, action: Index, low: Array, high: Array, strips: int) -> "Pieces":
-        """From one list of intervals, each with the strip that it belongs to."""
+        """Build from one list of intervals, each with its strip."""
         order = np.argsort(strip, kind="stable")
         row = strip[order]
         column = np.arange(row.size) - np.searchsorted(row, row)
@@ -55,9 +55,9 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """What the closed loop enters and never leaves, for each strip, (N,).
+    """Band that the closed loop enters and never leaves, for each strip, (N,).
 
-    invariant: the image of the start lies inside it. low, high: of the limit of images; nan where there is none.
+    invariant: the image of the start lies inside it. low, high: of the limit of images; nan without one.
     path: the images, from the start to the last, (K + 1, N, 2); taken: periods from one to the next, (K, N), in which
     the ends move evenly.
     """
@@ -69,7 +69,7 @@ class Band:
     taken: Index
 
     def until(self, low: Array, high: Array) -> Array:
-        """Periods until the state lies in [low, high], wherever it began, (N,); inf where it is not said to."""
+        """Return the periods until the state lies in [low, high] from any start, (N,); inf if not proven."""
         beyond = np.stack([low - self.path[..., 0], self.path[..., 1] - high], axis=2)
         moved = beyond[:-1] - beyond[1:]
         share = np.divide(beyond[:-1], moved, out=np.sign(beyond[:-1]), where=moved > 0.0)
@@ -78,21 +78,21 @@ class Band:
 
     @property
     def entered(self) -> Mask:
-        """Whether the images of the start reach the band, (N,); never where there is none."""
+        """Return whether the images of the start reach the band, (N,); False without a band."""
         return np.isfinite(self.until(self.low - ENTERED, self.high + ENTERED))
 
     @property
     def periods(self) -> Array:
-        """Periods until the state is inside, wherever it began, (N,)."""
+        """Return the periods until the state is inside from any start, (N,)."""
         return self.until(*(self.path[-1] + ENTERED * np.array([-1.0, 1.0])).T)
 
 
 def images(pieces: Pieces, shift: Array, start: Array) -> Band:
     """Iterate F^k(start) to its limit, F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
 
-    F(I) is part of F(J) for I inside J. So if F(start) is part of the start, every F^k(start) is part of the one before
-    it and is never left again; k periods are enough to reach it. Far out, where only the pieces without an end meet an
-    end of the interval, that end moves by the same step each period, and many periods are taken at once.
+    F is monotonic: F(I) is in F(J) for I in J. So if F(start) is in the start, the F^k(start) are nested, no state
+    leaves them, and k periods are enough to reach F^k(start). Far out, where an end of the interval meets only
+    unbounded pieces, that end moves by the same step each period, and many periods are taken at once.
 
     Args: shift: [low, high] that an action adds to the state, (N, A, 2). start: [low, high], (N, 2).
     """
@@ -119,7 +119,7 @@ def images(pieces: Pieces, shift: Array, start: Array) -> Band:
         invariant[active] &= inside  # by induction only the first image can be outside
         moved = np.abs(image - now) > ENTERED
         step, reach = outer[active].transpose(1, 0, 2)
-        ahead = image * np.array([-1.0, 1.0]) - reach  # periods in which an end goes on as it did
+        ahead = image * np.array([-1.0, 1.0]) - reach  # periods in which an end moves by the same step
         further = np.floor(np.divide(ahead, -step, out=np.zeros_like(step), where=(step < 0.0) & (ahead > 0.0)))
         further = np.where(moved, further, np.inf).min(axis=1)
         further = np.where(np.isfinite(further), further, 0.0)
@@ -135,7 +135,7 @@ def images(pieces: Pieces, shift: Array, start: Array) -> Band:
 
 
 def _outer(low: Array, high: Array, shift: Array) -> Array:
-    """How the upper end of an interval moves far out: [step, the least end from which it moves by that alone], (N, 2).
+    """Return the motion of the upper end far out: [step, the least end from which only that step applies], (N, 2).
 
     Args: low, high: of the pieces; shift: their largest shift; (N, P) each.
     """
@@ -149,7 +149,7 @@ def _outer(low: Array, high: Array, shift: Array) -> Array:
 
 
 def _spread(first: Index, last: Index) -> tuple[Index, Index]:
-    """Every pair (k, j) with first[k] <= j < last[k]."""
+    """List every pair (k, j) with first[k] <= j < last[k]."""
     count = np.maximum(last - first, 0)
     k = np.repeat(np.arange(count.size), count)
     return k, np.arange(k.size) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
@@ -157,7 +157,7 @@ def _spread(first: Index, last: Index) -> tuple[Index, Index]:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of polygons, each with its polygon and the strip or line that it lies in; all of shape (K,)."""
+    """Points of polygons, each with its polygon and its strip or line; all of shape (K,)."""
 
     polygon: Index
     strip: Index
@@ -168,7 +168,7 @@ class Points:
         """Find the states of each polygon in each strip: least and largest of `states` over its points.
 
         Args: action: of each polygon. states: (x, y) to [least, largest] state, each (K,); over a convex polygon both
-        have their extremes at corners. strips: how many there are.
+        have their extremes at corners. strips: their number.
         """
         key = self.polygon * strips + self.strip
         order = np.argsort(key, kind="stable")
@@ -179,7 +179,7 @@ class Points:
 
 
 def crossings(regions: Regions, lines: Array) -> Points:
-    """Where the edges of the polygons meet lines of constant second coordinate, given in rising order."""
+    """Find where the edges of the polygons meet lines of constant second coordinate, given in rising order."""
     (x0, y0), (x1, y1) = np.moveaxis(regions.edges, (1, 2), (0, 1))
     first = np.searchsorted(lines, np.minimum(y0, y1), "left")
     edge, line = _spread(first, np.searchsorted(lines, np.maximum(y0, y1), "right"))
@@ -200,15 +200,15 @@ def points_in_strips(regions: Regions, low: Array, high: Array) -> Points:
 
 
 def drops(regions: Regions) -> list[tuple[float, float, int, int]]:
-    """Where the action becomes smaller as the first coordinate rises: (first, second coordinate, from, to), exactly.
+    """Find exactly where the action decreases as the first coordinate rises: (first, second coordinate, from, to).
 
-    Between two neighbouring ordinates of corners a line of constant second coordinate meets the same polygons in the
-    same order, so one line between them stands for all.
+    Between two neighbouring ordinates of corners every line of constant second coordinate meets the same polygons in
+    the same order, so one line is enough.
     """
     ordinates = np.unique(regions.edges[:, 0, 1])
     lines = ((ordinates[1:] + ordinates[:-1]) / 2.0)[np.diff(ordinates) > SAME]
     met = crossings(regions, lines)
-    order = np.lexsort((met.x, met.polygon, met.strip))  # two crossings of each polygon, side by side
+    order = np.lexsort((met.x, met.polygon, met.strip))  # the two crossings of each polygon
     line, polygon, x = (a[order].reshape(-1, 2) for a in (met.strip, met.polygon, met.x))
     order = np.lexsort((x.sum(axis=1), line[:, 0]))
     line, action, left = line[order, 0], regions.action[polygon[order, 0]], x[order, 0]

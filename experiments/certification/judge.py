@@ -1,4 +1,4 @@
-"""The certificate of a policy: what is proven of it, and whether that is enough."""
+"""The certificate of a policy: its proven properties and their limits."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,14 +19,15 @@ __all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Requirement", "cert
 
 KINDS = SAFETY, PERFORMANCE = "safety", "performance"
 GRID = (256, 128)  # boxes of the cross-check
-ENOUGH = 100  # trajectories for each strip, from which on they may be asked to reach the ends of a band
+ENOUGH = 100  # trajectories per strip that are enough to require the ends of a band
 
 
 @dataclass(frozen=True)
 class Requirement:
     """One requirement: the worst value found, where, and the limit it must not exceed.
 
-    kind: one of `KINDS`. A device refuses a policy that fails a requirement of safety, and tells one of performance.
+    kind: one of `KINDS`. A device refuses a policy that fails a safety requirement, and reports a failed performance
+    requirement.
     """
 
     name: str
@@ -37,7 +38,7 @@ class Requirement:
 
     @property
     def holds(self) -> bool:
-        """Tell whether the requirement holds; nan holds nothing."""
+        """Return whether the requirement holds; not for nan."""
         return self.value <= self.limit
 
     @property
@@ -51,7 +52,7 @@ class Requirement:
 
 
 def worst(checks: Iterable[Requirement]) -> list[Requirement]:
-    """Return of each title the check that is farthest beyond its limit, relative to it; nan counts as farthest."""
+    """Return for each title the check with the largest value relative to its limit; nan counts as largest."""
     found: dict[str, Requirement] = {}
     for check in checks:
         if check.title not in found or _beyond(check) > _beyond(found[check.title]):
@@ -70,7 +71,7 @@ class Certificate:
 
     doses: how far below the setpoint each of `levels` may be given, periods of growth, (3, S).
     drops: where a higher reading gets a smaller dose, (first, second coordinate, from, to).
-    regions: the exact polygons of the policy. quick: without errors of the gain.
+    regions: exact polygons of the policy. quick: without gain errors.
     """
 
     question: Question
@@ -97,7 +98,7 @@ class Certificate:
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
-        """List what no policy can hold, as pump or growth are too weak; one line for all cases that share a stretch."""
+        """List the setpoints that no policy can hold, because pump or growth are too weak; one line per stretch."""
         found: dict[tuple[float, float], list[str]] = {}
         for proof in self.proofs:
             for stretch in _runs(self.question.loop, ~proof.holdable):
@@ -109,7 +110,7 @@ class Certificate:
         ]
 
     def told(self) -> list[str]:
-        """Every requirement that fails, and of each title that is met the case that comes closest to its limit."""
+        """List every failed requirement, and for each title that is met the case closest to its limit."""
         titles: dict[str, list[Requirement]] = {}
         for check in self.checks:
             titles.setdefault(check.title, []).append(check)
@@ -125,14 +126,14 @@ class Certificate:
 
 
 def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, float]]:
-    """Stretches of neighbouring strips."""
+    """Return stretches of neighbouring strips."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]])))
     for first, last in edges.reshape(-1, 2):
         yield float(loop.low[first]), float(loop.high[last - 1])
 
 
 def certify(policy: Policy, config: CertifyConfig) -> Certificate:
-    """Prove what can be proven of a policy. Raises: CertificationError where nothing can be asked."""
+    """Certify a policy. Raises: CertificationError if the policy is of no known kind."""
     asked, network = question(policy, config), Network.of(policy)
     exact, wider = partition(network, asked.box)
 
@@ -180,9 +181,9 @@ def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajector
 
 
 def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Requirement]:
-    """Every requirement with its worst strip. What the pump cannot hold fails in the nominal model alone.
+    """List every requirement with its worst strip. What the pump cannot hold fails only in the nominal model.
 
-    dose: how far below the setpoint half of the largest dose may be given, periods of growth, (S,).
+    dose: largest distance below the setpoint at which half of the largest dose is given, periods of growth, (S,).
     """
     every = np.ones(dose.size, dtype=bool)
     yield _count("nominal: strips that the pump cannot hold", asked, ~proofs[0].holdable)
@@ -236,7 +237,7 @@ def _place(asked: Question, low: float, high: float) -> str:
 def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
     """List the requirements that a policy fails at single setpoints, without an attack on its bands.
 
-    Of a policy of the OD along their lines, which need no polygons: another way to the same numbers.
+    For a policy of the OD along lines, an independent computation without polygons.
     """
     asked, network = question(policy, config, setpoints), Network.of(policy)
     if policy.observation == RELATIVE:

@@ -1,4 +1,4 @@
-"""A policy as a piecewise linear map of the plane: its layers in double precision, and what single precision adds."""
+"""A policy as a piecewise linear map of the plane, in double precision, and the error of single precision."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ __all__ = ["Array", "Network", "q_values", "rounding"]
 Array = NDArray[np.float64]
 
 UNIT = 2.0**-24  # relative rounding error of one operation in single precision
-SLACK = 1e-9  # of a Q value, more than the geometry's own rounding in double precision
+SLACK = 1e-9  # of a Q value; exceeds the rounding of the geometry in double precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Network:
 
     @property
     def hidden(self) -> list[tuple[Array, Array]]:
-        """The layers with a relu behind them, the first with the map of the inputs multiplied in."""
+        """Layers with a relu, the first combined with the input map."""
         (m, *inner), (c, *offsets) = self.weights[:-1], self.biases[:-1]
         layers = list(zip(inner, offsets, strict=True))
         if layers:
@@ -60,12 +60,12 @@ def q_values(network: Network, points: Array) -> Array:
 
 
 def rounding(network: Network, points: Array) -> Array:
-    """How far Q in single precision may be from the exact one at points (N, 2), shape (N, A).
+    """Bound the error of Q in single precision at points (N, 2), shape (N, A).
 
     A sum of n products in any order is off by at most g (|h| |W| + |b|), g = (n + 1) u / (1 - (n + 1) u), u = 2^-24
-    (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). relu enlarges no error; a unit that is off
-    passes on only the part of it that reaches above zero. On a cell where the network is linear the bound is convex:
-    its largest value at the corners holds inside.
+    (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). relu enlarges no error; an inactive unit
+    passes only the part above zero. On a cell where the network is linear the bound is convex, so its largest value at
+    the corners bounds the inside.
     """
     h, error = points, UNIT * np.abs(points)
     last = len(network.weights) - 1

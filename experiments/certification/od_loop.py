@@ -9,7 +9,7 @@ from experiments.certification.network import Array
 
 __all__ = ["OdCase", "OdLoop"]
 
-NEAR_ZERO = 1e-9  # share of a setpoint that stands for an OD of zero
+NEAR_ZERO = 1e-9  # fraction of a setpoint that represents an OD of zero
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class OdLoop:
 
     @property
     def growth(self) -> Array:
-        """What a period of nominal growth adds to d, (S,)."""
+        """Increase of d in a period of nominal growth, (S,)."""
         return np.full(self.low.size, self.mu * self.control_min)
 
     def at(self, setpoints: Array) -> "OdLoop":
@@ -51,7 +51,7 @@ class OdLoop:
         return replace(self, low=setpoints, high=setpoints)
 
     def shift(self, case: OdCase) -> Array:
-        """[least, largest] change of d by each action in a period, (S, A, 2).
+        """Return the [least, largest] change of d by each action in a period, (S, A, 2).
 
         Least: the smallest mu with the smallest tau, which dilutes most; largest: the other way round.
         """
@@ -64,15 +64,15 @@ class OdLoop:
         return np.log(np.stack([self.start[0] / self.high, self.start[1] / self.low], axis=1))
 
     def seen(self, case: OdCase) -> tuple[Array, Array]:
-        """Setpoints that the policy is shown in each strip."""
+        """Return the setpoints that the policy sees in each strip."""
         return self.low, self.high
 
     def states(self, case: OdCase) -> States:
-        """States behind a reading y at setpoint r: d of y -+ noise. Linear-fractional, so extreme at corners."""
+        """Return the states d of y -+ noise of a reading y at setpoint r. Linear-fractional, so extreme at corners."""
         return lambda y, r: (_log((y - case.noise) / r), _log((y + case.noise) / r))
 
     def law(self, case: OdCase) -> Pieces:
-        """Apply the one-line law of the nominal model: the rate nearest to tau (mu + ln(y / r) / h)."""
+        """Apply the one-line controller of the nominal model: the rate nearest to tau (mu + ln(y / r) / h)."""
         middle = (self.rates[1:] + self.rates[:-1]) / 2.0
         reading = np.exp(self.control_min * (middle / self.tau - self.mu))  # y / r between two rates
         off = case.noise / self.low[:, None]
@@ -81,7 +81,7 @@ class OdLoop:
         return Pieces(np.hstack([-ends, _log(reading - off)]), np.hstack([_log(reading + off), ends]), action)
 
     def half_width(self, low: Array, high: Array) -> Array:
-        """Largest |x - r| of a band in d, OD, (S,)."""
+        """Return the largest |x - r| of a band in d, OD, (S,)."""
         return self.high * np.maximum(np.expm1(high), -np.expm1(low))
 
     def within(self, half_width: Array) -> tuple[Array, Array]:
@@ -90,7 +90,7 @@ class OdLoop:
         return np.log(np.maximum(1.0 - ratio, NEAR_ZERO)), np.log1p(ratio)
 
     def key(self, case: OdCase) -> object:
-        """Every case is a loop of its own."""
+        """Return the case: every case is a loop of its own."""
         return case
 
     def in_od(self, case: OdCase, half_width: float) -> float:
@@ -98,12 +98,12 @@ class OdLoop:
         return half_width
 
     def attack(self, case: OdCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """Attack: what the policy is shown, (N, 2), and what a period then adds to d for each action, (N, A).
+        """Return what the policy sees under attack, (N, 2), and the change of d for each action, (N, A).
 
-        At 1, the reading is as low as it can be, growth is fastest and a dose takes off least; at -1 the other way
-        round; in between all of it is so much less.
-        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], of what is
-          shown and of what acts, (N, 2).
+        At push 1 the reading is lowest, growth fastest and a dose weakest; at -1 the opposite; in between
+        proportionally.
+        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], of the reading
+        and of the dynamics, (N, 2).
         """
         shows, acts = push.T
         setpoint = second.mean(axis=1) - shows * (second[:, 1] - second[:, 0]) / 2.0
@@ -114,5 +114,5 @@ class OdLoop:
 
 
 def _log(ratio: Array) -> Array:
-    """ln, -inf for an OD that is not above zero."""
+    """Return ln, -inf for an OD that is not above zero."""
     return np.log(ratio, out=np.full_like(ratio, -np.inf), where=ratio > 0.0)

@@ -1,4 +1,4 @@
-"""The plane cut into the convex polygons on which one action is best, exactly."""
+"""Exact convex polygons of the plane on which one action is best."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from experiments.certification.network import Array, Network, rounding
 
 __all__ = ["Regions", "area", "partition"]
 
-FLAT = 1e-12  # a value this close to zero lies on the line; far below what `rounding` allows for
+FLAT = 1e-12  # a value this close to zero is on the line; far below `rounding`
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Regions:
 
     @classmethod
     def of(cls, polygons: list[tuple[Array, int]]) -> "Regions":
-        """From corners (V, 2), in order, and action of each polygon."""
+        """Build from the corners (V, 2), in order, and the action of each polygon."""
         edges = [np.stack([corners, np.roll(corners, -1, axis=0)], axis=1) for corners, _ in polygons]
         sizes = [len(e) for e in edges]
         return cls(
@@ -36,7 +36,7 @@ class Regions:
 
 
 def area(regions: Regions) -> Array:
-    """Of each polygon, (P,): half the sum over its edges of x0 y1 - x1 y0, from its first corner."""
+    """Area of each polygon, (P,): half the sum over its edges of x0 y1 - x1 y0, from its first corner."""
     first = np.unique(regions.owner, return_index=True)[1]
     (x0, y0), (x1, y1) = np.moveaxis(regions.edges - regions.edges[first, :1][regions.owner], (1, 2), (0, 1))
     return np.abs(np.bincount(regions.owner, x0 * y1 - x1 * y0)) / 2.0
@@ -45,7 +45,7 @@ def area(regions: Regions) -> Array:
 def _clip(rows: Array, value: Array) -> Array:
     """Cut a convex polygon to the part where a linear function is >= 0.
 
-    Args: rows: corners in order with whatever is linear on the polygon beside them, (V, C). value: at them, (V,).
+    Args: rows: corners in order, with other linear values beside them, (V, C). value: of the function at them, (V,).
     """
     value = np.where(np.abs(value) <= FLAT, 0.0, value)
     after, following = np.roll(value, -1), np.roll(rows, -1, axis=0)
@@ -58,7 +58,7 @@ def _clip(rows: Array, value: Array) -> Array:
 def _cells(rows: Array, layers: list[tuple[Array, Array]]) -> Iterator[Array]:
     """Split a polygon into cells on which all units keep their sign, with the last layer's inputs at their corners.
 
-    Args: rows: corners and, behind them, what enters the first of `layers` there, (V, 2 + n).
+    Args: rows: corners, followed by the inputs of the first of `layers` there, (V, 2 + n).
     """
     if not layers:
         yield rows
@@ -77,7 +77,7 @@ def _cells(rows: Array, layers: list[tuple[Array, Array]]) -> Iterator[Array]:
 
 
 def _best(corners: Array, q: Array, slack: Array) -> Iterator[tuple[Array, int]]:
-    """Where each action's Q comes within the slack of every other's; a cell of linear Q falls into convex polygons.
+    """Find where each action's Q is within the slack of every other's; a cell of linear Q splits into convex polygons.
 
     Args: corners (V, 2); q: at them, (V, A). slack: of each action's Q, (A,).
     """
@@ -97,8 +97,8 @@ def _best(corners: Array, q: Array, slack: Array) -> Iterator[tuple[Array, int]]
 def partition(network: Network, box: tuple[tuple[float, float], tuple[float, float]]) -> tuple[Regions, Regions]:
     """Partition a rectangle of the plane by a policy, twice.
 
-    Returns: the exact polygons of the argmax, which tile the rectangle; and wider ones that hold every point at which
-    single precision may choose the action.
+    Returns: the exact polygons of the argmax, which tile the rectangle; and wider ones that contain every point at
+    which single precision may choose the action.
     Args: box: ((low, high) of the first coordinate, (low, high) of the second).
     """
     (x0, x1), (y0, y1) = box

@@ -1,4 +1,4 @@
-"""What is to be proven of a policy: its closed loops, what may disturb them, and how much is allowed."""
+"""What to prove of a policy: closed loops, disturbances, limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from experiments.certification.share_loop import ShareCase, ShareLoop
 
 __all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
 
-BEYOND = 1e-6  # the plane that is cut reaches this much beyond what is asked
+BEYOND = 1e-6  # margin of the plane beyond the required range
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
 
 
 class CertificationError(Exception):
-    """A policy that no certificate can be made of; the message says why and what to do."""
+    """Error of a policy that cannot be certified; the message has reason and remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,12 @@ class Question:
     """What is to be proven of a policy.
 
     loop: its closed loops. cases: what may disturb them; the first one is the nominal.
-    margins: case -> largest excess of the half-width over that of the law. judged: case -> limit of safety of that
+    margins: case -> largest half-width beyond the one-line controller's. judged: case -> limit of safety of that
     excess; a case that is not in it is not judged by its half-width.
-    late: case -> how many periods after the law the state may come to within the law's half-width and its margin; a
+    late: case -> periods after that controller within which the state must be in its half-width plus the margin; a
     case that is not in it is judged by the pump's own time. box: of the plane that the policy is shown.
-    reached: least share of the band that the attack is to reach, under exact estimates and under errors; None: not
-    judged, for a policy of the OD may rest at several places of a strip, and the hull of them is its band.
+    reached: least fraction of the band that the attack must reach, with exact estimates and with errors; None: not
+    judged, because a policy of the OD may rest at several places of a strip, and their hull is its band.
     unit: of half-widths. what: a strip is one of. setpoints: lowest and highest, OD.
     drawn: cases that a figure shows. bounds: of an estimator, where the policy needs one.
     median: limit of safety of the median excess over all strips of the nominal case; None: not judged.
@@ -67,8 +67,9 @@ def actions(policy: Policy) -> Array:
 def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     """Choose the nominal model: the one that is asked for, else the one the policy was trained on.
 
-    A policy of (error, growth share) serves any; that of the bench turns OD into e where bounds depend on the OD.
-    Raises: CertificationError where the policy does not say it, or has another control period.
+    A policy of (error, growth share) fits any model; the bench's model converts OD to e for bounds that depend on the
+    OD.
+    Raises: CertificationError if the policy has no model or another control period.
     """
     if policy.observation not in (ABSOLUTE, RELATIVE):
         seen = ", ".join(policy.observation)
@@ -91,7 +92,7 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
 
 
 def full_pump(model: EnvConfig) -> float:
-    """B, what one period of full pump takes off ln x."""
+    """Return B, the decrease of ln x in one period at full pump rate."""
     return model.max_pump_rate * model.control_min / model.tau
 
 
@@ -101,7 +102,7 @@ def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
 
 
 def _of_od(policy: Policy, config: CertifyConfig) -> Question:
-    """(OD, setpoint) in, a pump rate out."""
+    """Build the question of a policy from (OD, setpoint) to a pump rate."""
     model, limits = model_of(policy, config), config.limits
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))
@@ -128,7 +129,7 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
-    """(error, growth share) in, a share of the largest dose out."""
+    """Build the question of a policy from (error, growth share) to a fraction of the largest dose."""
     model, limits, (low, high) = model_of(policy, config), config.limits, config.growth_shares
     clip = (np.asarray(policy.low, dtype=np.float64), np.asarray(policy.high, dtype=np.float64))
     if not clip[0][1] - BEYOND <= low < high <= clip[1][1] + BEYOND:
@@ -173,8 +174,8 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
 
 
 def question(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None = None) -> Question:
-    """Build what is to be proven of this kind of policy. Raises: CertificationError where it cannot be asked.
+    """Build the question for this kind of policy. Raises: CertificationError for another kind.
 
-    Args: setpoints: at which errors that depend on the OD are asked about; None: the lowest, the middle, the highest.
+    Args: setpoints: of the cases whose errors depend on the OD; None: the lowest, the middle, the highest.
     """
     return _of_share(policy, config, setpoints) if policy.observation == RELATIVE else _of_od(policy, config)

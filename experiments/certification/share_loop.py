@@ -1,9 +1,9 @@
 """The closed loop of a policy that sees (error, growth share): e' = e + s - v, with e = ln(x / r) / B, s = mu h / B.
 
-B is what one period of full pump takes off ln x; v is the share of the full pump that is dosed. A pump gives another
-dose than it is asked for, in one of two forms. Every dose is off anew (`spread`): v acts as v (1 +- gain). Or the
-estimate of the gain is off for long (`slow`): v acts as asked, and e is seen in units of the estimated B, as
-(1 +- gain) e.
+B is the decrease of ln x in one period at full pump rate; v is the dose as a fraction of the full pump. The error of
+the gain has two forms. Each dose has its own error (`spread`): v acts as v (1 +- gain). Or the estimate of the gain is
+wrong for a long time (`slow`): v acts as requested, and the policy sees e in units of the estimated B, as (1 +- gain)
+e.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ __all__ = ["ShareCase", "ShareLoop"]
 
 @dataclass(frozen=True)
 class ShareCase:
-    """Bounds on the errors of e, s and the gain; at a setpoint where the bound of e depends on the OD.
+    """Bounds on the errors of e, s and the gain, at a setpoint if the bound of e depends on the OD.
 
-    slow: the error of the gain is that of its estimate, not of each dose.
+    slow: the gain error is in the estimate, not in each dose.
     """
 
     name: str
@@ -36,7 +36,7 @@ class ShareCase:
 
     @property
     def scale(self) -> float:
-        """Relative error of the unit in which e is seen."""
+        """Relative error of the unit of e."""
         return self.bounds.gain if self.slow else 0.0
 
 
@@ -44,7 +44,7 @@ class ShareCase:
 class ShareLoop:
     """Doses and strips of the growth share.
 
-    doses: shares of the full pump, rising from 0 to 1, (A,). start: range of OD from which the band is entered.
+    doses: fractions of the full pump, rising from 0 to 1, (A,). start: range of OD from which the band is entered.
     setpoints: lowest and highest. low, high: s of each strip, (S,). clip: ((e, s) lowest, (e, s) highest) that the
     policy sees; beyond, the nearest.
     """
@@ -58,11 +58,11 @@ class ShareLoop:
 
     @property
     def growth(self) -> Array:
-        """What a period of growth adds to e, (S,)."""
+        """Increase of e in a period of growth, (S,)."""
         return self.low
 
     def shift(self, case: ShareCase) -> Array:
-        """[least, largest] change of e by each action in a period, (S, A, 2)."""
+        """Return the [least, largest] change of e by each action in a period, (S, A, 2)."""
         least = self.low[:, None] - self.doses * (1.0 + case.spread)
         return np.stack([least, self.high[:, None] - self.doses * (1.0 - case.spread)], axis=2)
 
@@ -73,20 +73,20 @@ class ShareLoop:
         return np.broadcast_to(np.log(ratio) / (case.bounds.full_pump * (1.0 - case.scale)), (self.low.size, 2))
 
     def seen(self, case: ShareCase) -> tuple[Array, Array]:
-        """Growth shares that the policy may be shown in each strip."""
+        """Return the growth shares that the policy may see in each strip."""
         off = case.bounds.growth_share
         low, high = (np.clip(s, self.clip[0][1], self.clip[1][1]) for s in (self.low - off, self.high + off))
         return low, high
 
     def _around(self, case: ShareCase, seen: Array) -> tuple[Array, Array]:
-        """Bound e behind an estimate of it from below and above; both bounds rise with the estimate."""
+        """Bound the true e of an estimate from below and above; both bounds rise with the estimate."""
         off = case.bounds.error_at(seen, case.setpoint)
         low, high = seen - off, seen + off
         least, most = 1.0 - case.scale, 1.0 + case.scale
         return low / np.where(low > 0.0, most, least), high / np.where(high > 0.0, least, most)
 
     def states(self, case: ShareCase) -> States:
-        """States behind an estimate. One on the edge of what the policy sees stands for all beyond."""
+        """Return the possible states of an estimate. An estimate on the edge represents all beyond."""
         (lowest, _), (highest, _) = self.clip
 
         def around(e: Array, s: Array) -> tuple[Array, Array]:
@@ -96,7 +96,7 @@ class ShareLoop:
         return around
 
     def law(self, case: ShareCase) -> Pieces:
-        """Apply the one-line law: the dose nearest to clip(e + s, 0, 1)."""
+        """Apply the one-line controller: the dose nearest to clip(e + s, 0, 1)."""
         middle = (self.doses[1:] + self.doses[:-1]) / 2.0
         off = case.bounds.growth_share
         low, _ = self._around(case, middle - self.high[:, None] - off)
@@ -106,7 +106,7 @@ class ShareLoop:
         return Pieces(np.hstack([-ends, low]), np.hstack([high, ends]), action)
 
     def half_width(self, low: Array, high: Array) -> Array:
-        """Largest |e| of a band, (S,)."""
+        """Return the largest |e| of a band, (S,)."""
         return np.maximum(-low, high)
 
     def within(self, half_width: Array) -> tuple[Array, Array]:
@@ -114,7 +114,7 @@ class ShareLoop:
         return -half_width, half_width
 
     def key(self, case: ShareCase) -> object:
-        """Cases of one key have the same loop, as far as the policy tells errors apart."""
+        """Return a key; cases of the same key have the same loop."""
         (low, _), (high, _) = self.clip
         errors = case.bounds.error_at(np.linspace(low, high, 65), case.setpoint)
         return case.slow, case.bounds.gain, case.bounds.growth_share, errors.round(12).tobytes()
@@ -126,12 +126,12 @@ class ShareLoop:
         return float(case.setpoint * np.expm1(case.bounds.full_pump * (1.0 + case.scale) * half_width))
 
     def attack(self, case: ShareCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """Attack: what a state allows to be shown, (N, 2), and what a period then adds to e for each action, (N, A).
+        """Return what the policy sees under attack, (N, 2), and the change of e for each action, (N, A).
 
-        At 1, e and s are shown as low as they can be, doses give least and s is the strip's highest, of which the
-        policy may still be shown the lowest; at -1 the other way round; in between all of it is so much less.
-        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], of what is shown and
-          of what acts, (N, 2).
+        At push 1 the policy sees the lowest e and s, doses are smallest and s is the strip's highest; at -1 the
+        opposite; in between proportionally.
+        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], of the estimates and
+        of the dynamics, (N, 2).
         """
         b, (shows, acts) = case.bounds, push.T
         side, size = np.sign(shows), np.abs(shows)

@@ -1,4 +1,4 @@
-"""From a policy to what is proven of its closed loop, and whether that is enough."""
+"""Proof of a closed loop's band, and attacks on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from experiments.certification.network import Array
 
 __all__ = ["Loop", "Proof", "attacked", "dose_below", "prove"]
 
-STILL = 1e-9  # a smaller change of the state in a period is none
-ATTACKED = 60  # periods of a trajectory that tries to leave the band
-SETTLED = 20  # of them until it has forgotten where it began
-LESS = (0.0, 0.3)  # chances that disturbances are anything between, a half of the trajectories each
-TURNS = (0.5, 0.2, 0.05, 0.0)  # chances that it turns to the other side, a fourth of the trajectories each
+STILL = 1e-9  # smaller changes of the state in a period count as zero
+ATTACKED = 60  # periods of an attacking trajectory
+SETTLED = 20  # of them until the start has no influence
+LESS = (0.0, 0.3)  # probabilities of intermediate disturbances, for each half of the trajectories
+TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities of a change of side, for each quarter of the trajectories
 
 
 class Loop(Protocol):
-    """A family of closed loops with one number as state, a member per strip; cases are what may disturb it."""
+    """A family of closed loops with a scalar state, one per strip; cases are disturbances."""
 
     low: Array
     high: Array
@@ -41,11 +41,11 @@ class Loop(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """What is proven of a policy under one case, for each strip, (S,).
+    """Proof of a policy under one case, for each strip, (S,).
 
-    holdable: doing nothing lets the culture grow, and the full pump thins it, whatever the disturbance.
-    band, law: of the policy, and of the one-line law. half_width, law_half_width: of the bands.
-    margin: that a half-width may exceed the law's by. allowed: [lowest, highest] state of that half-width, (S, 2).
+    holdable: without a dose the culture grows, with the full pump it is diluted, under any disturbance.
+    band, law: of the policy, and of the one-line controller. half_width, law_half_width: of the bands.
+    margin: allowed half-width beyond the controller's. allowed: [lowest, highest] state of that half-width, (S, 2).
     entry: periods until the state is allowed, over those of the physics; inf: never.
     grows: below the range of starts every possible dose lets it grow.
     """
@@ -63,18 +63,18 @@ class Proof:
 
     @property
     def excess(self) -> Array:
-        """Half-width over that of the law, (S,)."""
+        """Half-width beyond the one-line controller's, (S,)."""
         return self.half_width - self.law_half_width
 
     @property
     def later(self) -> Array:
-        """Periods after the law until the state is within the law's half-width and `margin`, (S,); inf: never."""
+        """Periods after the one-line controller until within its half-width plus `margin`, (S,); inf: never."""
         of_policy, of_law = (band.until(*self.allowed.T) for band in (self.band, self.law))
         return of_policy - np.where(np.isfinite(of_law), of_law, 0.0)
 
 
 def physical(start: Array, shift: Array, goal: Array) -> Array:
-    """Periods from the ends of the range `start` into `goal`, at full pump and without, the slower one, (S,).
+    """Return the periods from the ends of `start` into `goal`, at full pump or without, the slower one, (S,).
 
     Args: start, goal: [lowest, highest] state, (S, 2). shift: [least, largest] of each action, (S, A, 2).
     """
@@ -85,10 +85,10 @@ def physical(start: Array, shift: Array, goal: Array) -> Array:
 
 
 def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 0.0) -> Proof:
-    """Prove for every strip what follows from where the policy may choose which action.
+    """Prove the band of every strip from the states in which each action may be chosen.
 
-    Args: points: of polygons in the strips that the policy is shown (`loop.seen`); action: of each polygon.
-      margin: that a half-width may exceed the law's by.
+    Args: points: of polygons in the strips that the policy sees (`loop.seen`); action: of each polygon. margin: allowed
+    half-width beyond the controller's.
     """
     pieces = points.pieces(action, loop.states(case), loop.low.size)
     shift, start = loop.shift(case), loop.range(case)
@@ -96,7 +96,7 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
     own = np.take_along_axis(shift[..., 0], pieces.action, axis=1)
     below = pieces.low <= start[:, :1]
     law_half_width = loop.half_width(law.low, law.high)
-    allowed = np.stack(loop.within(np.nan_to_num(law_half_width) + margin), axis=1)  # without a band: the margin alone
+    allowed = np.stack(loop.within(np.nan_to_num(law_half_width) + margin), axis=1)  # without a band: only the margin
     return Proof(
         case,
         (shift[:, 0, 0] > STILL) & (shift[:, -1, 1] < -STILL),
@@ -112,9 +112,9 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
 
 
 def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Sequence[int]) -> Array:
-    """How far below the setpoint each action or a higher one may still be chosen, periods of growth, (actions, S).
+    """Return how far below the setpoint each action or a higher one is chosen, periods of growth, (actions, S).
 
-    0 where it is only chosen above; no further than the range of starts reaches.
+    0 if it is only chosen above; limited to the range of starts.
     """
     pieces = points.pieces(action, loop.states(case), loop.low.size)
     lowest = np.stack([pieces.lowest(a) for a in actions])
@@ -124,11 +124,11 @@ def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Se
 def attacked(policy: Policy, loop: Loop, proof: Proof, trajectories: int) -> tuple[int, Array]:
     """Attack the proven band by trajectories of the policy itself, in single precision.
 
-    They start anywhere in the band of any strip that has one. Everything that may be off is off as far as it can be to
-    one side, which turns at random: often, which finds the steps of the policy, or seldom, which goes a long way. Now
-    and then it is anywhere in between, which leads to the places from which the ends are reached.
-    Returns: how many left the band. Share of each strip's band that they reached after `SETTLED` periods, (S,); nan for
-    strips without one.
+    They start anywhere in the band of a strip. Every disturbance has its largest size, with a sign that changes at
+    random: often, to find the steps of the policy, or seldom, to move far. Sometimes it is intermediate, to reach the
+    states from which the ends are reached.
+    Returns: the number that left the band; the fraction of each strip's band reached after `SETTLED` periods, (S,), nan
+    without a band.
     """
     rng = np.random.default_rng(0)
     proven = np.flatnonzero(proof.band.invariant & proof.holdable)

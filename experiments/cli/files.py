@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hardware.storage import atomic
 from hardware.storage.journal import plain
-from hardware.storage.yaml_text import read_text
+from hardware.storage.yaml_text import problem, read_text
 
 __all__ = ["choices", "given", "load_yaml", "plain", "write_json"]
 
@@ -29,7 +29,7 @@ def load_yaml(path: Path | str) -> DictConfig | ListConfig:
     except ValueError:
         raise
     except Exception as error:  # whatever PyYAML and OmegaConf meet
-        raise ValueError(f"not YAML ({str(error).splitlines()[0]})") from None
+        raise ValueError(f"not YAML ({problem(error)})") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, indent: int | None = 2) -> None:

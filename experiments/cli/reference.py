@@ -11,7 +11,7 @@ from typing import Any, cast, get_args, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
-from conf.presets import ROOT, chosen, commands, groups, owner, sentence
+from conf.presets import ROOT, chosen, commands, groups, owners, sentence
 from conf.schema import Entry, entries
 from experiments.cli.frame import EntryPoint
 from experiments.cli.help_page import shown
@@ -60,8 +60,8 @@ def page() -> str:
 
 def _said(name: str) -> str:
     """Describe a preset; a recipe with the command that it is for."""
-    of = owner(name)
-    return f"{of}: {sentence(name)}" if of else sentence(name)
+    of = owners(name)
+    return f"{of[0]}: {sentence(name)}" if of else sentence(name)
 
 
 def _anchor(heading: str) -> str:

@@ -32,10 +32,10 @@ def _choose(command: str, group: str, option: str) -> None:
     """Check that a command takes `group=option`. Raises: UserError naming what it takes, or the right command."""
     given, own = f"{group}={option}", presets.chosen(command)
     known = presets.groups()[group]
-    of = presets.owner(f"{group}/{option}") if option in known else None
-    if of not in (None, command):
+    of = presets.owners(f"{group}/{option}") if option in known else ()
+    if of and command not in of:
         what = "recipe" if group == "experiment" else "preset"
-        raise UserError(f"{given}: a {what} of {of}; python -m experiments.{of} +{given}")
+        raise UserError(f"{given}: a {what} of {of[0]}; python -m experiments.{of[0]} +{given}")
     if group not in own:
         others = [name for name in presets.commands() if group in presets.chosen(name)]
         takes = ", ".join(own) or "no group"
@@ -56,6 +56,7 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
       that cannot be used.
     """
     with refusing(ValueError):
+        _without_key(argv, command)
         argv = [latest.resolved(arg, command) for arg in argv]
         old = resumed(argv)
         if old:
@@ -76,7 +77,7 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
             for option in match[2].split(","):
                 _choose(command, match[1], option)
             if "," not in match[2] and (other := presets.companion(f"{match[1]}/{match[2]}")):
-                belongs.append(other)
+                belongs += [other] * (other.partition("=")[0] in presets.chosen(command))
         elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
@@ -87,6 +88,15 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
             raise UserError(f"resume={old}: no run folder (it holds no config.yaml); give the folder of a run")
         out += [f"{RUN}{old}", "hydra.output_subdir=null"]
     return out
+
+
+def _without_key(argv: Sequence[str], command: str) -> None:
+    """Refuse a word that has no key, naming the key that it may be of. Raises: UserError."""
+    key = {"calibrate": "data", "certify": "policy", "deploy": "policy", "score": "policy", "train": "env_file"}
+    for before, arg in zip(("", *argv), argv, strict=False):
+        if "=" not in arg and arg[:1] not in ("-", "~") and before[:1] != "-":
+            named = f"{key.get(command, 'run')}={arg}"
+            raise UserError(f"{arg}: values are given as KEY=VALUE; did you mean {named}? See --help")
 
 
 def _with_preset_files(arg: str) -> str:

@@ -23,10 +23,10 @@ class StudyConfig:
     plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
     controllers: tuple[str, ...] = setting(("dqn", "pi", "mpc"), "names of controllers")
     compositions: tuple[str, ...] = setting(
-        (), "names of laws of the composition; then `controllers` hold the density beside each of them"
+        (), "names of composition controllers; `controllers` then control the density beside each of them"
     )
-    announced: bool = setting(True, "of a composition: its changes are told ahead, as the scenario has it")
-    calibrated: bool = setting(False, "of a composition: each reactor's light sensor was calibrated")
+    announced: bool = setting(True, "composition: announce changes in advance, as the scenario says")
+    calibrated: bool = setting(False, "composition: each reactor has a calibrated light sensor")
 
 
 @dataclass(frozen=True)
@@ -37,38 +37,35 @@ class BenchmarkConfig:
         3, "vials per controller, plant and scenario (paper: 3), run as one batch", within=(1, 10_000)
     )
     seed: int = setting(
-        0, "of plants, noise, training and calibration; every controller meets the same draws", at_least=0
+        0, "random seed of plants, noise, training and calibration, equal for every controller", at_least=0
     )
-    env: EnvConfig = part(EnvConfig, "what model-based controllers believe, and agents are trained on")
+    env: EnvConfig = part(EnvConfig, "model for model-based controllers and for training")
     agents: dict[str, Any] = setting({}, "learned controllers by name", kinds=agent_schema)
-    train_seeds: int = setting(
-        4, "seeds an agent is trained with; the best policy on the selection grid controls", within=(1, 1000)
-    )
+    train_seeds: int = setting(4, "seeds per agent; the best policy on the selection grid is used", within=(1, 1000))
     workers: int = setting(
-        0, "processes for the closed loops; 0: one per core, 1: this one only. No effect on results", within=(0, 256)
+        0, "processes for the closed loops; 0: one per core, 1: only this one. No effect on results", within=(0, 256)
     )
     policies: dict[str, str] = setting(
         {},
-        "policies of learned controllers by name, in place of training: a policy.npz, a run folder, `shipped`, or "
-        "a folder policies/ of a training, each of whose seeds is a row; without one, a controller that no agent is "
-        "named after follows `shipped`",
+        "policies of learned controllers by name, instead of training: a policy.npz, a run folder, `shipped`, or the "
+        "folder policies/ of a training (one row per seed). A controller with neither policy nor agent uses `shipped`",
     )
-    calibration: bool = setting(False, "simulate the open-loop protocol and fit it (Fig. 2a)")
-    training: bool = setting(False, "train all agents even if no study needs them (Fig. 2b)")
+    calibration: bool = setting(False, "simulate and fit the open-loop protocol (Fig. 2a)")
+    training: bool = setting(False, "train all agents, also those that no study needs (Fig. 2b)")
     pair: str = setting(
         "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
     )
     plants: dict[str, PlantConfig] = setting({}, "plants by name")
     plant_file: str | None = setting(
-        None, "a twin.yaml of calibrate, as plant `twin`; each vial begins at an hour of its own, drawn over its knots"
+        None, "a twin.yaml of calibrate, as plant `twin`; each vial starts at a random time within its knots"
     )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
     controllers: dict[str, Any] = setting({}, "controllers by name", kinds=registry.config_at)
-    compositions: dict[str, Any] = setting({}, "laws of the composition by name", kinds=registry.config_at)
+    compositions: dict[str, Any] = setting({}, "composition controllers by name", kinds=registry.config_at)
     composition_policies: dict[str, str] = setting(
-        {}, "policies of learned laws of the composition by name: `shipped`, a policy.npz or a run folder"
+        {}, "policies of learned composition controllers by name: `shipped`, a policy.npz or a run folder"
     )
-    studies: dict[str, StudyConfig] = setting({}, "what is compared, by name; the recipes of experiment/ fill it")
+    studies: dict[str, StudyConfig] = setting({}, "comparisons by name; the recipes of experiment/ define them")
 
     def __post_init__(self) -> None:
         check(self)

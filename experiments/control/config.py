@@ -24,67 +24,65 @@ OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
 class DeployConfig:
     """`python -m experiments.deploy`."""
 
-    backend: Any = part(SimulatedConfig, "what is controlled", lambda kind, _: family(kind).config())
-    plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
-    bench: Bench = part(Bench, "volume, control period and pump: what everybody has to know alike")
+    backend: Any = part(SimulatedConfig, "device or simulation", lambda kind, _: family(kind).config())
+    plant: PlantConfig = part(PlantConfig, "simulated vials, for backend=sim")
+    bench: Bench = part(Bench, "volume, control period and pump, for all parts of the program")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
-    scenario: Scenario = part(Scenario, "what the culture is asked to do")
+    scenario: Scenario = part(Scenario, "setpoints and their times")
     at_end: str = setting(
         "hold",
-        "a reactor whose schedule is over while others go on: hold the last setpoint, stop dosing, or regulate: hand "
-        "over to the device's own regulation, which goes on after the run",
+        "a reactor whose schedule ends before the others: hold the last setpoint, stop dosing, or regulate (the "
+        "device's own regulation takes over and continues after the run)",
         choices=AT_END,
     )
     each: dict[str, Any] = setting(
         {},
-        "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control "
+        "settings of single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control "
         "each.M1.at_end=stop",
     )
-    controller: Any = part(LearnedConfig, "what decides the pump rate", registry.config_at)
+    controller: Any = part(LearnedConfig, "controller of the pump rate", registry.config_at)
     policy: str = setting(
         "shipped",
-        "of controller=dqn: `shipped`, the policy that comes with the program and needs no calibration; a policy.npz; "
-        "a run folder; or `latest`: what train or demo wrote last",
+        "policy of controller=dqn: `shipped` (needs no calibration), a policy.npz, a run folder, or `latest`: the "
+        "newest one of train or demo",
     )
     poor_regret_pct: float = setting(
         10.0,
-        "a run warns of a policy of more regret than this; the worst of 32 seeds of agent=paper has 11",
+        "regret above which a run warns of a policy; the worst of 32 seeds of agent=paper has 11",
         "%",
         above=0.0,
     )
-    force_policy: bool = setting(
-        False, "run a policy on a device although no certificate says that it is safe for this run"
-    )
+    force_policy: bool = setting(False, "run a policy on a device without a certificate that it is safe for this run")
     composition: Any = setting(
         None,
-        "what decides the temperature where the scenario asks for a share: a preset of `composition`; null: nothing",
+        "controller of the temperature if the scenario has a composition: a preset of `composition`; null: none",
         kinds=registry.config_at,
     )
     composition_policy: str = setting(
         "shipped",
-        "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder: of a training its policy, of a "
-        "deployment the policy that it used",
+        "policy of composition=dqn and dqn_preview: `shipped`, a policy.npz, or the run folder of a training or "
+        "deployment",
     )
-    share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
+    share_warnings: ShareWarnings = part(ShareWarnings, "warnings of a composition out of control")
     signals: dict[str, Any] = setting(
         {},
-        "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE",
+        "further controlled signals, from extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE",
         kinds=registry.config_at,
     )
     pair: str = setting(
         "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
     )
-    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose model the simulated plant takes")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: model of the simulated plant")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     notify: str = setting(
         "",
-        "who is told of start, alarms, hand-overs and end: a command that reads lines of JSON, or env:NAME, a variable "
-        "with a command or an address; an address on the command line goes on as env:DEPLOY_HOOK; empty: nobody",
+        "receiver of start, alarms, hand-overs and end: a command that reads lines of JSON, or env:NAME, a variable "
+        "with a command or an address; empty: nobody",
     )
-    fsync: bool = setting(True, "every row on the disk before the next command")
-    dry_run: bool = setting(False, "print the timetable and what would be used, ask no device, write nothing")
+    fsync: bool = setting(True, "write every row to the disk before the next command")
+    dry_run: bool = setting(False, "print the timetable and the parts of the run; contact no device, write nothing")
     preflight_only: bool = setting(False, "check the device and stop")
-    resume: str | None = setting(None, "a run folder to continue after a crash, or `latest`")
+    resume: str | None = setting(None, "a run folder to continue, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)

@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 class ControllerConfig:
     """What the config of every controller has."""
 
-    kind: str = setting("", "which controller")
+    kind: str = setting("", "controller")
 
     def __post_init__(self) -> None:
         check(self, "controller")

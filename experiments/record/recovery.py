@@ -168,7 +168,8 @@ def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row |
     decisions = [r for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
     if not decisions or not len(rows) or rows.last()["time_min"] != decisions[-1]["row"]["time_min"]:
         return None
-    given = volumes(journal, name)[decisions[-1]["n"]]
+    earlier = np.nansum(rows.columns["volume_ml"][:-1])  # with what the rows after them corrected
+    given = sum(volumes(journal, name).values()) - float(earlier)
     if abs(given - rows.last()["volume_ml"]) <= 1e-6:
         return None
     return {c: _kept(decisions[-1]["row"], c) for c in rows.names} | {"volume_ml": given}

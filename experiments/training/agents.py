@@ -1,4 +1,4 @@
-"""What can learn a task: `build` makes agents from their config; `add` makes another kind known."""
+"""Kinds of agents: `build` makes agents from their config, `add` registers another kind."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,14 +22,14 @@ Streams = Mapping[str, Sequence[np.random.SeedSequence]]
 
 
 class AgentKind(NamedTuple):
-    """What makes agents from config, task, streams and device, and the names of the streams that it needs."""
+    """Function that makes agents from config, task, streams and device, and its stream names."""
 
     make: Callable[[Any, Task, Streams, str], Agent]
     streams: tuple[str, ...]
 
 
 def _dqn(config: DQNConfig, task: Task, streams: Streams, device: str) -> DQNAgent:
-    """Make deep Q-learners. Raises: ValueError where one never learns, or its inputs are those of another task."""
+    """Make deep Q-learners. Raises: ValueError if they never learn, or if the inputs are those of another task."""
     if config.learn_start >= config.total_steps:
         raise ValueError(
             f"agent.learn_start = {config.learn_start}: allowed 0 to {config.total_steps - 1}, below "
@@ -51,14 +51,14 @@ KINDS: dict[type[Any], AgentKind] = {DQNConfig: AgentKind(_dqn, STREAMS)}
 def add(
     kind: str, config: type[Any], make: Callable[[Any, Task, Streams, str], Agent], streams: Sequence[str], what: str
 ) -> None:
-    """Make an agent known as `train agent=KIND`.
+    """Register an agent as `train agent=KIND`.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`; with `total_steps`.
       make: called with config, task, streams and device.
-      streams: names of the random streams that it needs.
-      what: the sentence that the help shows.
+      streams: names of its random streams.
+      what: sentence in the help.
     Raises: ValueError for a kind that exists.
     """
     if kind in AGENTS:
@@ -75,7 +75,7 @@ def names(config: Any) -> tuple[str, ...]:
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
     """Make one agent per seed of each stream.
 
-    Raises: ValueError for a config that the task cannot be learned with, or an agent that lacks a part of `Agent`.
+    Raises: ValueError for a config that does not fit the task, or an agent that lacks a method of `Agent`.
     """
     made = KINDS[type(config)].make(config, task, streams, device)
     if missing := [part for part in PARTS if not hasattr(made, part)]:

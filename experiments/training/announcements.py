@@ -1,4 +1,4 @@
-"""What a training run tells: at its start what is learned and how well it should be, on its way, and at its end."""
+"""Messages of a training run: task and limits at the start, progress, result at the end."""
 
 import logging
 import shlex
@@ -29,7 +29,7 @@ def _seeds(seeds: Sequence[int]) -> str:
 
 
 def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, step: int) -> None:
-    """Say what is learned, what is good, and where to watch. Args: step: where a resumed run goes on, else 0."""
+    """Log the task, its limits, and where to watch. Args: step: first step of a resumed run, else 0."""
     chosen = choices(folder)
     names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
     where = f"goes on at step {step} of" if step else "for"
@@ -44,7 +44,7 @@ def _pair(regret: Array, steady: Array, unit: str) -> str:
 
 
 def progress(step: int, total: int, seconds: float, score: Score, best: tuple[Array, Array], task: Task) -> str:
-    """Medians over agents on the selection grid, now and of what is kept, with the time left.
+    """Describe the medians over agents on the selection grid, current and kept, and the remaining time.
 
     Args: seconds: of training so far. best: regret and steady error of the kept policies, (S,) each.
     """
@@ -55,7 +55,7 @@ def progress(step: int, total: int, seconds: float, score: Score, best: tuple[Ar
 
 
 def _verdict(score: Score, task: Task) -> str:
-    """Which of the two limits every agent keeps."""
+    """Describe which of the two limits all agents meet."""
     good = score.regret_pct.max() <= task.regret_unit, score.steady_abs_error.max() <= task.steady_unit
     words = ["within" if holds else "beyond" for holds in good]
     limits = f"{task.regret_unit:g} % regret", f"{task.steady_unit:g} {task.unit} at rest"
@@ -68,10 +68,10 @@ def ended(
     folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, pair: str | None = None,
     whole: bool = True,
 ) -> None:  # fmt: skip
-    """Say what was reached, against what, and what to do with it.
+    """Log the result, its comparison, and the next step.
 
-    Args: spent: steps, updates and time, in words. pair: of two species, as it was asked for. whole: it was trained
-      for all its steps.
+    Args: spent: steps, updates and time, as text. pair: of two species, as requested. whole: the training did all its
+    steps.
     """
     many = kept.regret_pct.size > 1
     worst = f"; the worst of {kept.regret_pct.size}: {kept.regret_pct.max():.2f} %, {kept.steady_abs_error.max():.4f}"
@@ -86,7 +86,7 @@ def ended(
     if task.tried:
         file = shlex.quote(str(path))
         good = (kept.regret_pct <= task.regret_unit) & (kept.steady_abs_error <= task.steady_unit)
-        if task.provable and whole and good.any():  # seldom proven of one beyond the limits, or stopped at them
+        if task.provable and whole and good.any():  # a certificate is rare beyond the limits, or at them
             log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
         pair_words = "" if pair is None else f"pair={shlex.quote(pair)} "
         log.info("next, try it: python -m experiments.deploy %s%s", pair_words, task.tried.format(file))
@@ -112,7 +112,7 @@ def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Seque
 
 
 def results(writer: PopulationWriter, step: int, kept: Score, task: Task, seeds: Sequence[int]) -> None:
-    """Write what the HPARAMS table and the text page show at the end."""
+    """Write the final HPARAMS table and text page."""
     for events, regret, steady in zip(writer.agents, kept.regret_pct, kept.steady_abs_error, strict=False):
         events.scalars({"result/regret_pct": float(regret), "result/steady_abs_error": float(steady)}, step)
     limits = ("limit", f"{task.regret_unit:g}", f"{task.steady_unit:g}")

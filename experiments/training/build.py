@@ -1,4 +1,4 @@
-"""From an agent's config to agents in their environments, and from weights to the policies they stand for."""
+"""Agents in their environments from a config, and policies from weights."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,10 +17,10 @@ __all__ = ["act_with", "population", "streams", "trainer"]
 
 
 def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.random.SeedSequence]]:
-    """For each name one SeedSequence per seed, independent of the other names and seeds.
+    """Make for each name one SeedSequence per seed, independent of the other names and seeds.
 
-    The stream of a name depends on its seed and its place in `names` only, so agent i of a population has the streams
-    of the same seed alone. New names go at the end.
+    The stream of a name depends on its seed and its place in `names` only, so agent i of a population has the same
+    streams as a single agent with its seed. Append new names at the end.
     """
     spawned = [np.random.SeedSequence(seed).spawn(len(names)) for seed in seeds]
     return {name: [children[k] for children in spawned] for k, name in enumerate(names)}
@@ -29,14 +29,14 @@ def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.ran
 def population(
     task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
 ) -> Population:
-    """Agents with the given seeds in groups of a size that suits the device; arguments as `Population`."""
+    """Make agents with the given seeds in groups of a suitable size; arguments as `Population`."""
     size = GROUP if device == "cpu" else len(seeds)
     groups = [seeds[k : k + size] for k in range(0, len(seeds), size)]
     return Population([trainer(task, agent, group, device) for group in groups], threads)
 
 
 def trainer(task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu") -> Trainer:
-    """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
+    """Make one group of agents with the given seeds, each with its own environment; one record per episode."""
     own = streams(seeds, (*agents.names(agent), "env"))
     return Trainer(task.copies(own["env"]), agents.build(agent, task, own, device), interval=task.episode_steps)
 

@@ -36,7 +36,7 @@ def agent_schema(kind: str, key: str = "agent") -> Any:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
+    """`python -m experiments.train`. Raises: ValueError with key, value and allowed range."""
 
     env: Any = part(EnvConfig, "the training model and its episodes", env_schema)
     agent: Any = part(DQNConfig, "the agent's hyper-parameters", agent_schema)
@@ -46,25 +46,25 @@ class TrainConfig:
     )
     env_file: str | None = setting(
         None,
-        "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env. Of env=coculture and "
-        "coculture_preview a run that held a share: its growth curves",
+        "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env. For env=coculture and "
+        "coculture_preview also a run with a composition: its growth curves",
     )
-    seed: int = setting(0, "of the first agent", at_least=0)
-    n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
-    device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
+    seed: int = setting(0, "seed of the first agent", at_least=0)
+    n_agents: int = setting(1, "number of agents, with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
+    device: str = setting("cpu", "device on which networks are trained", choices=("cpu", "cuda"))
     threads: int | None = setting(
-        None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
+        None, "groups of 16 agents trained in parallel; null: one per core. No effect on results", at_least=1
     )
     eval_every: int = setting(
-        100, "between evaluations of the greedy policy on the selection grid: once per episode", "steps", at_least=1
+        100, "steps between evaluations of the greedy policy on the selection grid", "steps", at_least=1
     )
     stop_within: float | None = setting(
         None,
-        "ends training once the kept policies of all agents are within so many times the limits of their task, 0.5 % "
-        "regret and 0.003 OD steady error for env=sim, on the selection grid; null: after agent.total_steps",
+        "stop when the kept policies of all agents are within this multiple of the task's limits on the selection grid "
+        "(env=sim: 0.5 % regret, 0.003 OD steady error); null: never",
         above=0.0,
     )
-    checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
+    checkpoint_every: int = setting(1000, "steps between checkpoints", "steps", at_least=1)
     resume: str | None = setting(None, "a run folder to continue, or `latest`")
 
     def __post_init__(self) -> None:

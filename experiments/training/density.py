@@ -1,4 +1,4 @@
-"""The paper's task for a training run: OD and setpoint in, a pump rate out, on a model with a known mu and tau."""
+"""The paper's task for a training run: from OD and setpoint to a pump rate, on a model with known mu and tau."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -21,11 +21,11 @@ from experiments.training.evaluation import Rollout, each, pairs, rollout
 __all__ = ["DensityTask", "first_actions"]
 
 Array = NDArray[np.float64]
-COARSE = 2e-3  # of log OD: enough for a picture
+COARSE = 2e-3  # of log OD, for a figure
 
 
 class DensityTask:
-    """See `Task`; arguments and errors of every method are described there."""
+    """The task of density control; `Task` describes arguments and errors of every method."""
 
     observation: tuple[str, ...] = ABSOLUTE
     unit = "OD"
@@ -33,7 +33,7 @@ class DensityTask:
     provable = True
     steady_steps = 30
     regret_unit, steady_unit = 0.5, 0.003
-    """Half a per cent of cost is not seen in a recording, and 0.003 OD is the noise of the sensor."""
+    """Half a per cent of cost is invisible in a recording, and 0.003 OD is the noise of the sensor."""
     tried = "controller=dqn policy={}"
 
     def __init__(self, config: EnvConfig) -> None:
@@ -46,29 +46,29 @@ class DensityTask:
         self._factors = step_factors(config)
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> BioreactorVectorEnv:
-        """Environments."""
+        """Return the environments."""
         env = BioreactorVectorEnv(len(seeds), self.config)
         env.seed_streams(seeds)
         return env
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Goals of replayed transitions: the task's range of setpoints and its reward."""
+        """Return the relabelling of replayed transitions with setpoints of the task."""
         setpoints = self.config.setpoints
         return GoalRelabel(agent, (min(setpoints), max(setpoints)), tracking_reward)
 
     def selection_grid(self) -> Array:
-        """20 start ODs x setpoints."""
+        """Return 20 start ODs x setpoints."""
         return self._grid(np.linspace(0.1125, 1.0875, 20))
 
     def report_grid(self) -> Array:
-        """linspace(0.1, 1.1, 41) x setpoints."""
+        """Return linspace(0.1, 1.1, 41) x setpoints."""
         return self._grid(np.linspace(*SCORED_OD, 41))
 
     def _grid(self, starts: Array) -> Array:
         return pairs(starts, np.unique(self.config.setpoints))
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance x <- f_a x; x - setpoint."""
+        """Advance x <- f_a x; the error is x - setpoint."""
         setpoint = observation[..., 1]
         od = np.minimum(observation[..., 0] * self._factors[action], MAX_OD)
         return np.stack([od, setpoint], axis=-1), od - setpoint
@@ -78,7 +78,7 @@ class DensityTask:
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
-        """By backward induction."""
+        """Solve by backward induction."""
         od, setpoint = start.T
         state, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
         for s in np.unique(setpoint):
@@ -87,16 +87,16 @@ class DensityTask:
         return Rollout(state, state - setpoint, action)
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """argmin_a |f_a x - s|."""
+        """Return argmin_a |f_a x - s|."""
         after = observation[..., :1] * self._factors
         return np.asarray(np.abs(after - observation[..., 1:]).argmin(axis=-1))
 
     def model(self) -> dict[str, Any]:
-        """Control period and the whole model."""
+        """Return the control period and the whole model."""
         return {"control_min": self.config.control_min, "model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Pump rate over OD and setpoint; OD over time from both ends of the starts."""
+        """Draw the pump rate over OD and setpoint, and the OD over time from both ends of the starts."""
         env = self.config
         od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
         x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
@@ -121,7 +121,7 @@ class DensityTask:
 def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp]:
     """Return the optimum's first action of an episode from each OD towards each setpoint, (G,), (G,) -> (G,).
 
-    The model is linear in x, so that the best action depends on x / setpoint alone, and one solution serves all.
+    The model is linear in x, so the best action depends only on x / setpoint, and one solution is enough.
     """
     lowest = float(setpoint.min())
     scaled = od * lowest / setpoint
@@ -129,4 +129,4 @@ def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp
     return solve_episode(wide, lowest, COARSE).act(scaled, env.episode_steps)
 
 
-_optimum = lru_cache(maxsize=16)(solve_episode)  # the grids of a run have the same setpoints
+_optimum = lru_cache(maxsize=16)(solve_episode)  # all grids of a run have the same setpoints

@@ -1,4 +1,4 @@
-"""How good a policy is on its task: noise-free rollouts on a grid, compared with the optimum."""
+"""Score of a policy on its task: noise-free rollouts on a grid, compared with the optimum."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Act = Callable[[Array], NDArray[np.intp]]
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """After each step, shape (K, S, G): `state`, the first number of the observation, and `error`; `action` in it."""
+    """Values of each step, shape (K, S, G): `action`, and after it `state` (the first observation) and `error`."""
 
     state: Array
     error: Array
@@ -29,7 +29,7 @@ class Rollout:
 class Score:
     """Per agent, shape (S,): cost J, regret in per cent of the optimum's, steady error at the worst setpoint.
 
-    steady_by_setpoint: the same at each setpoint (or whatever `asked` is), shape (S, M).
+    steady_by_setpoint: the same at each setpoint (value of `asked`), shape (S, M).
     mean_abs_error: over all steps and starts, shape (S,).
     """
 
@@ -40,15 +40,15 @@ class Score:
 
     @property
     def steady_abs_error(self) -> Array:
-        """Largest over the setpoints, shape (S,): an offset at one of them is an offset that a lab sees."""
+        """Largest over the setpoints, shape (S,): a lab sees an offset at a single setpoint."""
         return np.asarray(self.steady_by_setpoint.max(axis=-1))
 
 
 class Evaluated(Protocol):
-    """What an evaluation needs of a task.
+    """Task as an evaluation needs it.
 
-    steps: of a rollout; steady_steps: the last of them, over which the steady error is taken.
-    arrived: error within which the optimum is at rest.
+    steps: of a rollout; steady_steps: last steps, used for the steady error. arrived: error below which the optimum is
+    at rest.
     """
 
     steps: int
@@ -56,17 +56,17 @@ class Evaluated(Protocol):
     arrived: float
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Observation after one step, (..., O), and the error whose square is its cost, (...)."""
+        """Return the observation after one step, (..., O), and the error whose square is its cost, (...)."""
 
     def asked(self, start: Array) -> Array:
-        """Return what groups the steady errors of episodes with starts (G, O), e.g. the setpoint, (G,)."""
+        """Return the value by which steady errors are grouped, e.g. the setpoint, (G,), for starts (G, O)."""
 
     def best(self, start: Array) -> Rollout:
         """Solve each episode from starts (G, O); the optimum is the only policy (S = 1) of the rollout."""
 
 
 def pairs(first: Array, second: Array) -> Array:
-    """Every pair of two lists of numbers, the first slowest, (A B, 2)."""
+    """Return every pair of two lists of numbers, the first slowest, (A B, 2)."""
     return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
@@ -76,7 +76,7 @@ def each(policy: Policy) -> Act:
 
 
 def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
-    """Noise-free closed loop of S policies from G starts. Args: act: the policies. start: (S, G, O)."""
+    """Run the noise-free closed loop of S policies from G starts. Args: act: the policies. start: (S, G, O)."""
     shape = (task.steps, *start.shape[:-1])
     run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
     observation = start
@@ -88,14 +88,14 @@ def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
 
 
 class Evaluation:
-    """Scores policies on one grid against the optimum of the same model, actions, starts and number of steps.
+    """Score of policies on one grid against the optimum of the same model, actions, starts and steps.
 
-    J = mean over the grid of sum over the steps of error^2 taken after each step (the start's own error is not
-    counted); regret_pct = 100 (J / J* - 1); steady_abs_error = the largest over the setpoints of the median over starts
-    and last `steady_steps` of |error|. Starts are left out from which the optimum is still on its way then, further
-    than `arrived` (and than from the best start) from the setpoint: a slow pump does not thin 1.1 to 0.2 in time.
+    J = mean over the grid of sum over the steps of error^2 taken after each step (without the error of the start);
+    regret_pct = 100 (J / J* - 1); steady_abs_error = the largest over the setpoints of the median over starts and last
+    `steady_steps` of |error|. A start is ignored if the optimum has not arrived by then: its error exceeds `arrived`
+    and that from the best start. E.g. a slow pump does not dilute 1.1 to 0.2 in time.
 
-    Args: task: what is scored. start: observations at the start, (G, O).
+    Args: task: to score. start: observations at the start, (G, O).
     """
 
     def __init__(self, task: Evaluated, start: Array) -> None:
@@ -113,7 +113,7 @@ class Evaluation:
         return np.asarray(np.square(run.error).sum(axis=0).mean(axis=-1))
 
     def _steady(self, run: Rollout) -> Array:
-        """Median of each setpoint, shape (S, M)."""
+        """Return the median of each setpoint, shape (S, M)."""
         last = np.abs(run.error[-self.task.steady_steps :])
         return np.stack([np.median(last[..., there], axis=(0, 2)) for there in self._resting], axis=-1)
 

@@ -1,4 +1,4 @@
-"""The task in relative coordinates for a training run: error and growth share in, a share of the largest rate out."""
+"""The task in relative coordinates for a training run: from error and growth share to a pump rate."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -23,14 +23,14 @@ Array = NDArray[np.float64]
 
 
 class Relative:
-    """See `Task`; arguments and errors of every method are described there."""
+    """The relative task; `Task` describes arguments and errors of every method."""
 
     observation: tuple[str, ...] = RELATIVE
     unit = "periods of full pump"
     arrived = 0.1  # periods of full pump
     provable = True
     regret_unit, steady_unit = 0.01, 0.1
-    """Its own steady error is half the spacing of the levels and hardly tells policies apart: regret does."""
+    """The steady error is half the spacing of the levels and hardly distinguishes policies; regret does."""
 
     steps, steady_steps = 100, 30
     scalars: Mapping[str, float] = {}
@@ -41,37 +41,37 @@ class Relative:
         self.episode_steps = config.episode_steps
         self.description = "growth takes {:g} to {:g} of the largest pump rate".format(*config.growth_shares)
         self.actions = config.levels()
-        # Beyond the largest error of training the policy sees that error: full pump or none is right there too.
+        # Beyond the largest error of training the policy sees that error: full pump or none is also right there.
         span = config.largest_error - 0.05
         low, high = config.growth_shares
         self.limits = (np.array([-span, low]), np.array([span, high]))
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> RelativeVectorEnv:
-        """Environments."""
+        """Return the environments."""
         env = RelativeVectorEnv(len(seeds), self.config)
         env.seed_streams(seeds)
         return env
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Another setpoint shifts the error."""
+        """Return the relabelling: a new setpoint shifts the error."""
         return ShiftRelabel(agent, self.config.largest_error, relative_reward)
 
     def selection_grid(self) -> Array:
-        """20 errors x 25 growth shares."""
+        """Return 20 errors x 25 growth shares."""
         return self._grid(20, 25, 0.3)
 
     def report_grid(self) -> Array:
-        """41 errors x 48 growth shares."""
+        """Return 41 errors x 48 growth shares."""
         return self._grid(41, 48, 0.5)
 
     def _grid(self, errors: int, shares: int, place: float) -> Array:
-        """Midpoints (or other places) of equal cells, so that no two grids share a point."""
+        """Return midpoints (or other places) of equal cells, so that grids share no point."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         e = span * (2.0 * (np.arange(errors) + place) / errors - 1.0)
         return pairs(e, low + (high - low) * (np.arange(shares) + place) / shares)
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance e <- e + s - v; e itself."""
+        """Advance e <- e + s - v; the error is e."""
         s = observation[..., 1]
         error = observation[..., 0] + s - self.actions[action]
         return np.stack([error, s], axis=-1), error
@@ -81,7 +81,7 @@ class Relative:
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
-        """By backward induction."""
+        """Solve by backward induction."""
         error, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
         for s in np.unique(start[:, 1]):
             here = start[:, 1] == s
@@ -98,7 +98,7 @@ class Relative:
         return {"model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Share of the largest pump rate over error and growth share; error over time."""
+        """Draw the fraction of the largest pump rate over error and growth share, and the error over time."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         error, share = np.linspace(-span, span, 241), np.linspace(low, high, 97)
         e, s = (a.ravel() for a in np.meshgrid(error, share))

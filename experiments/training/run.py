@@ -1,4 +1,4 @@
-"""One training run from its config to what it leaves: a policy file per agent, figures and summary.json."""
+"""One training run from its config to its output files: a policy per agent, figures and summary.json."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     """Train, export and report; returns the objective of a sweep: the merit of the worst seed.
 
     Merit is that of `session.merit` on the selection grid: 1 is the limit of the task, lower is better. The reported
-    grid stays unseen by whoever chooses hyper-parameters.
+    grid is not used to choose hyper-parameters.
     """
     if config.env_file is not None:
         composed = isinstance(config.env, CocultureConfig)
@@ -50,7 +50,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
     if isinstance(config.env, EnvConfig):
         _warn_of_growth(config.env)
-    torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
+    torch.set_num_threads(1)  # per operation: small matrices do not gain from more
     try:
         with frame.refusing(ValueError):
             session = Session(config, folder, resume=config.resume is not None)
@@ -65,7 +65,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 
 def _warn_of_growth(env: EnvConfig) -> None:
-    """Say that no policy can hold a culture that the largest rate does not thin: f >= 1 for every action."""
+    """Warn if no policy can hold the culture: f >= 1 for every action, so even the largest rate does not dilute it."""
     if step_factors(env).min() >= 1.0:
         log.warning(
             "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g it takes more than mu tau = %.4g mL/s to thin "
@@ -113,13 +113,13 @@ def _finish(session: Session) -> None:
 
 
 def fingerprint(config: TrainConfig) -> str:
-    """Short hash of everything that shapes the policy."""
+    """Return a short hash of everything that determines the policy."""
     relevant = {"env": asdict(config.env), "agent": asdict(config.agent)}
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _export(session: Session, score: Score) -> tuple[Path, Policy]:
-    """Every agent's best policy under policies/, the best agent's as policy.npz, which is returned with its file."""
+    """Write every agent's best policy to policies/ and the best agent's to policy.npz; return that one and its file."""
     c, best, task = session.config, session.best, session.task
     folder = session.folder / "policies"
     folder.mkdir(exist_ok=True)
@@ -145,11 +145,11 @@ def _export(session: Session, score: Score) -> tuple[Path, Policy]:
 
 
 def _figures(session: Session, exported: Policy) -> None:
-    """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
+    """Draw learning curves, policy map and example trajectories, as files and in TensorBoard."""
     best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
     returns = np.array(session.returns)
-    ended = ~np.isnan(returns).all(axis=1)  # no episode ends in what is left over of the last interval
+    ended = ~np.isnan(returns).all(axis=1)  # no episode ends in the rest of the last interval
     curves = (returns[ended], history[:, 0], history[:, 1:], best.step.astype(float))
     drawn = {"learning": charts.learning(*curves), **session.task.figures(exported)}
     for name, figure in drawn.items():

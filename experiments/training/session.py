@@ -28,14 +28,14 @@ __all__ = ["BestSoFar", "Session", "merit"]
 
 log = logging.getLogger(__name__)
 
-LINES = 20  # of progress where there is no terminal
+LINES = 20  # between progress lines without a terminal
 PER_AGENT = ("merit", "regret", "steady", "step", "updates")  # arrays of `BestSoFar`, (S,)
 
 
 def merit(score: Score, task: Task) -> NDArray[np.float64]:
-    """How far a policy is from what matters, (S,), lower is better: the larger of regret and steady error in units.
+    """Return the merit of a policy, (S,), lower is better: the larger of regret and steady error in units.
 
-    Regret alone does not see a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost. The steady
+    Regret alone does not show a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost. The steady
     error is that of the worst setpoint.
     """
     return np.maximum(score.regret_pct / task.regret_unit, score.steady_abs_error / task.steady_unit)
@@ -43,7 +43,7 @@ def merit(score: Score, task: Task) -> NDArray[np.float64]:
 
 @dataclass
 class BestSoFar:
-    """For each agent the weights that scored best on the selection grid so far, and every score."""
+    """Best weights of each agent on the selection grid so far, and all scores."""
 
     weights: torch.Tensor  # (S, P)
     merit: NDArray[np.float64]  # (S,)
@@ -56,7 +56,7 @@ class BestSoFar:
 
     @classmethod
     def empty(cls, weights: torch.Tensor) -> BestSoFar:
-        """Nothing scored yet; `weights` (S, P) stand until something is."""
+        """Return a record without scores; `weights` (S, P) count until the first score."""
         n = weights.shape[0]
         worst = np.full((3, n), np.inf)
         step, updates = np.zeros((2, n), dtype=np.int64)
@@ -87,12 +87,12 @@ class BestSoFar:
 
 
 class Session:
-    """The parts of one training run and what it accumulates.
+    """Parts and accumulated results of one training run.
 
     Args:
-      config: what to train. folder: run folder, for events, progress.csv and checkpoint.pt.
+      config: of the training. folder: run folder, for events, progress.csv and checkpoint.pt.
       resume: continue from the folder's checkpoint.
-    Raises: dqn.checkpoint.CheckpointError where there is none to continue from.
+    Raises: dqn.checkpoint.CheckpointError without a checkpoint to continue from.
     """
 
     def __init__(self, config: TrainConfig, folder: Path, resume: bool = False) -> None:
@@ -104,7 +104,7 @@ class Session:
         self.selection = Evaluation(self.task, self.task.selection_grid())
         self.best = BestSoFar.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
-        self.seconds = 0.0  # spent training, over all lives
+        self.seconds = 0.0  # spent training, including earlier starts
         if resume:
             state = checkpoint.load(folder / "checkpoint.pt")
             self.agents.load_state_dict(state["agents"])
@@ -127,13 +127,13 @@ class Session:
         return score
 
     def met(self) -> bool:
-        """Whether every kept policy is as good as `stop_within` asks for."""
+        """Return whether every kept policy meets `stop_within`."""
         within = self.config.stop_within
         return within is not None and bool((self.best.merit <= within).all())
 
     @property
     def ended(self) -> str:
-        """Why training ended, in announcements."""
+        """Reason of the end, for messages."""
         within = self.config.stop_within
         if within is None or not self.met():
             return "agent.total_steps"
@@ -142,7 +142,7 @@ class Session:
         return f"every kept policy is within {limits} on the selection grid"
 
     def _news(self, record: TrainRecord) -> str:
-        """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""
+        """Describe the medians over agents on the selection grid, current and kept; "" before an update."""
         if not record.updates and record.step < self.config.agent.total_steps:
             return "untrained: no update yet"
         score, kept = self.evaluate(record.step), (self.best.regret, self.best.steady)
@@ -180,11 +180,11 @@ class Session:
     def run(self) -> None:
         """Train to the end, or until the limits are met: log every episode, evaluate, checkpoint, show progress.
 
-        Raises: KeyboardInterrupt after a signal, with a checkpoint of the episode that was going on. A batch system's
-        own handler may end the job in its own way instead, or let it go on.
+        Raises: KeyboardInterrupt after a signal, with a checkpoint of the running episode. A batch system's own handler
+        may end the job or let it continue.
         """
         c = self.config
-        if self.met():  # resumed after its end
+        if self.met():  # resumed after the end
             return
         total, last = c.agent.total_steps, self.agents.steps
         line_every = max(c.eval_every, total // LINES)

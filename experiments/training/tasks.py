@@ -1,4 +1,4 @@
-"""What a training run needs to know of a task; `of` finds it from the config of an environment."""
+"""Tasks of a training run; `of` returns the task of an environment's config."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
@@ -29,14 +29,14 @@ Array = NDArray[np.float64]
 
 
 class Task(Evaluated, Protocol):
-    """What an agent acts in, is scored on and exports.
+    """Task of an agent: environment, scores, export.
 
     config: of the environment, of any class. observation: O names, as in the policy file. actions: the grid, (A,).
     limits: of the observation in the policy file, low and high, each (O,). regret_unit, steady_unit: per cent of cost
-    and steady error that weigh alike when policies are compared. episode_steps: of a training episode.
-    description: numbers that say which model it is, for the log. scalars: the same for TensorBoard's table of runs.
+    and steady error of equal weight in a comparison of policies. episode_steps: of a training episode.
+    description: numbers of the model, for the log. scalars: the same for TensorBoard's table of runs.
     provable: whether `certify` can prove its closed loop.
-    tried: the words with which `deploy` runs a policy of this task, {} for its file; "" where it cannot.
+    tried: arguments with which `deploy` runs a policy of this task, {} for its file; "" if it cannot.
     """
 
     config: Any
@@ -53,25 +53,25 @@ class Task(Evaluated, Protocol):
     steady_unit: float
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> TrainingEnv:
-        """One copy of the environment per seed."""
+        """Return one copy of the environment per seed."""
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """How replayed transitions are given another goal."""
+        """Return the relabelling of replayed transitions with new goals."""
 
     def selection_grid(self) -> Array:
-        """Return the starts, (G, O), on which policies are compared during training."""
+        """Return the starts, (G, O), for the comparison of policies during training."""
 
     def report_grid(self) -> Array:
         """Return the reported grid; it shares no point with `selection_grid`."""
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """Choose the action whose next error is smallest (one-line law), (..., O) -> (...)."""
+        """Choose the action with the smallest next error (one-line controller), (..., O) -> (...)."""
 
     def model(self) -> dict[str, Any]:
-        """Describe the model that a policy was trained on, for its file."""
+        """Describe the model of the training, for the policy's file."""
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Policy map and example trajectories beside the optimum's."""
+        """Draw the policy map and example trajectories beside the optimum's."""
 
 
 TASKS: dict[type[Any], Callable[[Any], Task]] = {
@@ -83,12 +83,12 @@ TASKS: dict[type[Any], Callable[[Any], Task]] = {
 
 
 def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) -> None:
-    """Make a task known as `train env=KIND`.
+    """Register a task as `train env=KIND`.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      task: called with the config. what: the sentence that the help shows.
+      task: called with the config. what: sentence in the help.
     Raises: ValueError for a kind that exists.
     """
     if kind in ENVS:
@@ -98,7 +98,7 @@ def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) ->
 
 
 def kind(config: Any) -> str:
-    """Return the name under which the config of an environment is known."""
+    """Return the registered name of an environment's config."""
     return next(name for name, known in ENVS.items() if known is type(config))
 
 

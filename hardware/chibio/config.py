@@ -20,38 +20,38 @@ class ChiBioConfig:
     Raises: ValueError naming key, value and allowed range.
     """
 
-    kind: str = setting("chibio", "which backend")
-    url: str = setting("http://192.168.7.2:5000", "of the device's server")
-    speed: float = setting(1.0, "device seconds per real second; more only for a fast emulator", within=(0.1, 1000))
+    kind: str = setting("chibio", "backend")
+    url: str = setting("http://192.168.7.2:5000", "address of the device's server")
+    speed: float = setting(1.0, "device seconds per real second; above 1 only for a fast emulator", within=(0.1, 1000))
     reactors: tuple[str, ...] = setting(("M0",), "positions to run, all in one process", choices=POSITIONS, some=True)
     transport: TransportConfig = part(TransportConfig, "the link to the device")
     calibration: str = setting(
-        "calibration", "folder with the files of calibrate_pump and blank; what is missing there is nominal"
+        "calibration", "folder with the files of calibrate_pump and blank; a missing file means nominal values"
     )
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
-    stir: float = setting(0.5, "stirrer", within=(0, 1))
-    dosing: DosingConfig = part(DosingConfig, "how a rate becomes a dose")
+    stir: float = setting(0.5, "stirrer power", within=(0, 1))
+    dosing: DosingConfig = part(DosingConfig, "conversion of a pump rate into a dose")
     overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
-    supply: SupplyConfig = part(SupplyConfig, "spare pumps that steps of a scenario give by")
-    fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "a second measurement of the culture")
-    stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(65, 600))
+    supply: SupplyConfig = part(SupplyConfig, "spare pumps for scenario.outputs and signals")
+    fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "fluorescence measurement")
+    stale_s: float = setting(100.0, "age at which the newest sample is too old for a dose", "s", within=(65, 600))
     lost_s: float = setting(
         180.0, "age at which a dead experiment thread is restarted; more than stale_s", "s", within=(100, 3600)
     )
-    poll_s: float = setting(2.0, "between two looks for a sample that is due", "s", within=(0.2, 10))
+    poll_s: float = setting(2.0, "time between two requests for an expected sample", "s", within=(0.2, 10))
     window_s: float = setting(
         38.0,
-        "a dose must end this long after its sample appeared; the next measurement begins 47 s after",
+        "latest end of a dose after its sample; the next measurement begins after 47 s",
         "s",
         within=(10, 42),
     )
-    retry_s: float = setting(5.0, "before a failed request is tried again", "s", within=(0.5, 60))
+    retry_s: float = setting(5.0, "time before a failed request is repeated", "s", within=(0.5, 60))
     stop_s: float = setting(
-        60.0, "how long a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
+        60.0, "time in which a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
     )
     deadman_s: float = setting(
         120.0,
-        "silence after which a board agent, where there is one, switches pumps off: its --deadman",
+        "silence after which the board agent, if present, switches the pumps off: its --deadman",
         "s",
         within=(20, 3600),
         note="what a dose may have repeated until then is booked",
@@ -78,16 +78,15 @@ class ChiBioConfig:
 class EmulatorConfig(ChiBioConfig):
     """`backend=emulator`: the same driver against an emulator that the run starts by itself; `url` is then ignored."""
 
-    kind: str = setting("emulator", "which backend")
+    kind: str = setting("emulator", "backend")
     speed: float = setting(
         60.0,
-        "device seconds per real second: ninety minutes pass in one and a half; 0: virtual time, as fast as the "
-        "computer can, without sockets",
+        "device seconds per real second; 0: virtual time, as fast as possible, without sockets",
         within=(0, 1000),
     )
-    od: float = setting(0.3, "of the emulated cultures at the start", "OD", within=(0, 4))
+    od: float = setting(0.3, "OD of the emulated cultures at the start", "OD", within=(0, 4))
     plant: str = setting(
-        "healthy", "preset of the cultures and pumps; bench: each vial has its own", choices=tuple(groups()["plant"])
+        "healthy", "preset of cultures and pumps; bench: every vial is different", choices=tuple(groups()["plant"])
     )
-    pair: str = setting("ecoli_pputida", "of two species: a preset of conf/strains, or a pair.yaml")
-    seed: int = setting(0, "of all noise", at_least=0)
+    pair: str = setting("ecoli_pputida", "two species: a preset of conf/strains, or a pair.yaml")
+    seed: int = setting(0, "random seed of all noise", at_least=0)

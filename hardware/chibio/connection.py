@@ -42,7 +42,7 @@ class Connection:
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
     the answer names this reactor and its pinned identity (docs/device.md, Selection). A command is sent only if the
     last verified read saw this reactor present: one request to an absent one ends the whole server (docs/device.md,
-    Absent reactors). After a request without an answer, or `SEEN_S` without a request, the next command looks first.
+    Failures). After a request without an answer, or `SEEN_S` without a request, the next command looks first.
 
     Args:
       name: position, M0 to M7. permitted: what this client may send.
@@ -75,19 +75,17 @@ class Connection:
         Raises: LinkError, ProtocolError; DeviceStateError if it is absent or another client keeps selecting reactors;
           IdentityError if another unit answers at this position than before.
         """
-        selected = ""
         for _ in range(tries):
             start = self.clock.now()
             self._post(f"/changeDevice/{self.name}", quiet=True)
             state = self._look()
-            selected = state.selected
-            if selected == self.name:
+            ours = state.device_id != "" and self.device_id in ("", state.device_id)
+            if state.selected == self.name and ours:
                 break
-        else:
-            raise DeviceStateError(
-                f"{self.name} cannot be read: the device shows {selected}; another client keeps selecting reactors"
-            )
-        if not state.device_id or (self.device_id and state.device_id != self.device_id):
+        if state.selected != self.name:
+            why = f"the device shows {state.selected}; another client keeps selecting reactors"
+            raise DeviceStateError(f"{self.name} cannot be read: {why}")
+        if not ours:  # nor the times before: one answer may be garbled on its way
             self.state = None
             raise IdentityError(
                 f"{self.name} answers with identity {state.device_id or 'none'}, pinned is {self.device_id or 'none'}"
@@ -112,7 +110,7 @@ class Connection:
         if (
             last is not None
             and (last.selected, last.start_time) == (state.selected, state.start_time)
-            and (state.sample_s < last.sample_s or state.cycles < last.cycles)
+            and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # else the board's clock
         ):
             raise LinkError("an answer of an earlier time came again; look for a proxy or tunnel that keeps answers")
         if self.name not in state.present:

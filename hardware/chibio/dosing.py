@@ -37,11 +37,11 @@ class PumpCalibration:
     """
 
     flow_ml_s: float = setting(1.0, "flow at full power", "mL/s", within=(0.05, 5.0))
-    bias_s: float = setting(0.0, "the motor runs so much longer than asked", "s", within=(-1.0, 1.0))
+    bias_s: float = setting(0.0, "time by which the motor runs longer than requested", "s", within=(-1.0, 1.0))
     spread: float = setting(0.1, "sd of a single dose relative to its volume", within=(0.0, 1.0))
-    min_on_s: float = setting(0.3, "shortest on-time that delivers dependably", "s", within=(0.0, 2.0))
-    date: str = setting("", "when it was weighed; '': never, nominal values")
-    device_id: str = setting("", "on which unit it was weighed")
+    min_on_s: float = setting(0.3, "shortest reliable on-time", "s", within=(0.0, 2.0))
+    date: str = setting("", "date of the weighing; '': never, nominal values")
+    device_id: str = setting("", "unit on which the pump was weighed")
 
     def __post_init__(self) -> None:
         check(self, "pump calibration")
@@ -92,10 +92,10 @@ class DosingConfig:
     height of the waste tube, so too much does no harm.
     """
 
-    waste_factor: float = setting(4.0, "waste over feed, in time", at_least=4.0, note="less risks an overflow")
-    waste_extra_s: float = setting(4.4, "and so much longer", "s", at_least=4.0, note="less risks an overflow")
-    clear_every: int = setting(5, "doses from one clearing of the waste tube to the next", at_least=1)
-    clear_duty: float = setting(0.25, "of 63 s, which the waste pump then runs", above=0.0, at_most=MAX_WASTE_DUTY)
+    waste_factor: float = setting(4.0, "waste time over feed time", at_least=4.0, note="less risks an overflow")
+    waste_extra_s: float = setting(4.4, "additional waste time", "s", at_least=4.0, note="less risks an overflow")
+    clear_every: int = setting(5, "doses between two clearings of the waste tube", at_least=1)
+    clear_duty: float = setting(0.25, "of 63 s: how long the waste pump then runs", above=0.0, at_most=MAX_WASTE_DUTY)
 
     def __post_init__(self) -> None:
         check(self, "dosing")
@@ -105,11 +105,9 @@ class DosingConfig:
 class SupplyConfig:
     """Spare pumps that give a second medium, an inducer or a stressor; none as a rule, as their tubes are not there."""
 
-    pump3_ml_s: float = setting(
-        0.0, "flow of Pump3 at full power, as weighed; 0: it has no tube", "mL/s", within=(0, 1.5)
-    )
-    pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 1.5))
-    bias_s: float = setting(0.0, "both run so much longer than asked, as weighed", "s", within=(-0.2, 0.5))
+    pump3_ml_s: float = setting(0.0, "weighed flow of Pump3 at full power; 0: no tube", "mL/s", within=(0, 1.5))
+    pump4_ml_s: float = setting(0.0, "weighed flow of Pump4 at full power; 0: no tube", "mL/s", within=(0, 1.5))
+    bias_s: float = setting(0.0, "extra time for which both pumps run, as weighed", "s", within=(-0.2, 0.5))
 
     def __post_init__(self) -> None:
         check(self, "backend.supply")

@@ -58,7 +58,7 @@ class ChiBioFamily(Family):
         """As the family says, and a new run is checked first. Raises: ReactorError."""
         backend, earlier = opening.backend, opening.earlier()
         with ExitStack() as stack:
-            with not_looked_at():
+            with not_looked_at(opening.resumed):
                 transport, clock = stack.enter_context(self.linked(backend, opening.bench))
                 calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
                 if not earlier:

@@ -27,11 +27,11 @@ class FluorescenceSlotConfig:
     """
 
     measure: bool = setting(False, "measure fluorescence with every sample")
-    slot: str = setting("FP1", "of the device; the others must be off", choices=SLOTS)
-    led: str = setting("LEDA", "that excites: LEDA 395 nm, LEDB 457, LEDC 500, LEDD 523, LEDE 595", choices=LEDS)
-    base_band: str = setting("CLEAR", "that the device divides by", choices=BANDS)
-    band: str = setting("nm440", "that is read; not the base band", choices=BANDS)
-    gain: str = setting("x10", "of the spectrometer, its code", choices=tuple(f"x{k}" for k in range(11)))
+    slot: str = setting("FP1", "fluorescence slot of the device; the others must be off", choices=SLOTS)
+    led: str = setting("LEDA", "excitation: LEDA 395 nm, LEDB 457, LEDC 500, LEDD 523, LEDE 595", choices=LEDS)
+    base_band: str = setting("CLEAR", "band by which the device divides", choices=BANDS)
+    band: str = setting("nm440", "emission band; not the base band", choices=BANDS)
+    gain: str = setting("x10", "gain code of the spectrometer", choices=tuple(f"x{k}" for k in range(11)))
 
     def __post_init__(self) -> None:
         check(self, "backend.fluorescence")

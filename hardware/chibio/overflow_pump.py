@@ -25,10 +25,10 @@ class OverflowPumpConfig:
     Raises: ValueError naming key, value and allowed range.
     """
 
-    pump: str = setting("", "of the second line; '': there is none, the standard hardware", choices=(*SPARE, ""))
-    duty: float = setting(0.1, "share of every 63 s in which it runs", within=(MIN_DUTY, MAX_OVERFLOW_DUTY))
+    pump: str = setting("", "overflow pump; '': none (standard hardware)", choices=(*SPARE, ""))
+    duty: float = setting(0.1, "fraction of every 63 s for which it runs", within=(MIN_DUTY, MAX_OVERFLOW_DUTY))
     flow_ml_s: float = setting(
-        1.0, "at full power, as weighed; only for what the preflight says", "mL/s", within=(0.05, 5)
+        1.0, "weighed flow at full power; only for the preflight report", "mL/s", within=(0.05, 5)
     )
 
     def __post_init__(self) -> None:

@@ -238,6 +238,7 @@ class ChibioStation:
             state = self._keep_on(self.connection.read())
         except (LinkError, ProtocolError, DeviceStateError) as error:
             self.book.report(fault_of(error, present=self.connection.state is not None))
+            self.sampling.not_taken(is_new=True)  # one may have appeared unseen
             return False
         return False if self.busy else self._judge(state)
 

@@ -42,7 +42,7 @@ def plant_preset(name: str) -> PlantConfig:
 class DeviceOptions:
     """How the emulated device is built."""
 
-    unit: int = setting(0, "which of several devices: no two of them have the same identities", at_least=0)
+    unit: int = setting(0, "number of the device; different devices have different identities", at_least=0)
     vial: VialConfig = part(VialConfig, "optics and electronics")
     plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
 

@@ -58,25 +58,25 @@ class VialConfig:
     take on the bus: 0.2 to 0.7 s is what the device's own software took on simulated electronics with bus time.
     """
 
-    blank_low: float = setting(11600.0, "least counts of clear medium", within=(3000, 60000))
-    blank_high: float = setting(15800.0, "and most", at_most=60000.0)
-    noise_fraction: float = setting(0.003, "sd of one reading, as a fraction of raw", within=(0, 0.2))
+    blank_low: float = setting(11600.0, "lowest counts of clear medium", within=(3000, 60000))
+    blank_high: float = setting(15800.0, "highest counts of clear medium", at_most=60000.0)
+    noise_fraction: float = setting(0.003, "sd of one reading relative to the raw counts", within=(0, 0.2))
     common_fraction: float = setting(
-        0.004, "sd that all readings of one measurement share, as a fraction of raw", within=(0, 0.2)
+        0.004, "sd common to all readings of one measurement, relative to the raw counts", within=(0, 0.2)
     )
-    outlier_rate: float = setting(0.006, "per measurement: an isolated jump of more than 0.04 OD", within=(0, 1))
-    stir_factor: float = setting(0.4, "raw while stirring, relative to still", within=(0.05, 1))
-    stir_noise: float = setting(0.05, "its spread", within=(0, 0.5))
+    outlier_rate: float = setting(0.006, "probability of an isolated jump of more than 0.04 OD", within=(0, 1))
+    stir_factor: float = setting(0.4, "raw counts while stirring, relative to still medium", within=(0.05, 1))
+    stir_noise: float = setting(0.05, "relative spread of that factor", within=(0, 0.5))
     on_time_bias_low_s: float = setting(
-        0.02, "a pump runs at least so much longer than asked (docs/device.md, Pumps)", "s", within=(0, 1)
+        0.02, "shortest extra on-time of a pump (docs/device.md, Pumps)", "s", within=(0, 1)
     )
-    on_time_bias_high_s: float = setting(0.2, "and at most", "s", at_most=1.0)
+    on_time_bias_high_s: float = setting(0.2, "longest extra on-time of a pump", "s", at_most=1.0)
     pump_start_low_s: float = setting(
-        0.2, "least time from the answer to a pump command until the motor turns", "s", within=(0, 5)
+        0.2, "shortest time from the reply to a pump command until the motor turns", "s", within=(0, 5)
     )
-    pump_start_high_s: float = setting(0.7, "and most", "s", at_most=5.0)
-    pump3_ml_s: float = setting(0.0, "flow of Pump3 where it supplies a second fluid", "mL/s", within=(0, 5))
-    pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 5))
+    pump_start_high_s: float = setting(0.7, "longest such time", "s", at_most=5.0)
+    pump3_ml_s: float = setting(0.0, "flow of Pump3 if it supplies a second fluid", "mL/s", within=(0, 5))
+    pump4_ml_s: float = setting(0.0, "flow of Pump4 if it supplies a second fluid", "mL/s", within=(0, 5))
     overflow_pump: str = setting("", "pump whose tube ends a little above the waste tube", choices=(*SPARE, ""))
 
     def __post_init__(self) -> None:

@@ -1,12 +1,12 @@
 """The configured link to a device, for one client per device on this computer."""
 
-import fcntl
 import hashlib
-import json
 import os
+import socket
+import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from hardware.errors import DeviceStateError
@@ -18,43 +18,39 @@ __all__ = ["DeviceLock", "open_transport"]
 
 
 class DeviceLock:
-    """A locked file for a device; the kernel frees it when it is closed or the process ends.
+    """A device's name in the kernel: one for all users of this computer, free when it is closed or the process ends.
 
-    The file keeps the session under which this computer is known to a board agent: who takes over from a client that
-    was killed goes on under its name and is in charge at once.
+    A file keeps the session under which this user is known to a board agent: who takes over from a client that was
+    killed goes on under its name and is in charge at once.
 
     Args: device: its address, or what else names it: one device may have several names, each is locked.
     Raises: DeviceStateError if another process holds it.
     """
 
     def __init__(self, device: str) -> None:
-        name = hashlib.sha256(device.encode()).hexdigest()[:16]
-        self._file = open(Path(tempfile.gettempdir()) / f"chibio-{name}.lock", "a+")  # noqa: SIM115 (held)
+        name = f"chibio-{hashlib.sha256(device.encode()).hexdigest()[:16]}"
+        self._held, holder = socket.socket(socket.AF_UNIX), "unknown"
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._held.bind(f"\0{name}")
+            self._held.listen()
         except OSError as error:
-            holder = self._read().get("process", "unknown")
-            self.close()
+            with closing(self._held), suppress(OSError):
+                self._held.connect(f"\0{name}")
+                holder = str(struct.unpack("3i", self._held.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0])
             raise DeviceStateError(
                 f"{device} is already controlled by process {holder}: one client per device"
             ) from error
-        session = self._read().get("session")
-        self.session = session if isinstance(session, int) and 0 < session < 2**16 else new_session()
-        self._file.truncate(0)
-        json.dump({"process": os.getpid(), "session": self.session}, self._file)
-        self._file.flush()
-
-    def _read(self) -> dict[str, object]:
-        self._file.seek(0)
+        kept = Path(tempfile.gettempdir()) / f"{name}.{os.getuid()}"
         try:
-            found = json.load(self._file)
-        except ValueError:
-            return {}
-        return found if isinstance(found, dict) else {}
+            self.session = int(kept.read_text()) % 2**16 or new_session()
+        except (OSError, ValueError):
+            self.session = new_session()
+        with suppress(OSError):
+            kept.write_text(str(self.session))
 
     def close(self) -> None:
         """Free it. Idempotent."""
-        self._file.close()
+        self._held.close()
 
 
 @contextmanager

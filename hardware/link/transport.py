@@ -152,19 +152,19 @@ class TransportConfig:
     The device's server kills a worker that takes 30 s. Prefer a port /dev/serial/by-id/..., which survives replugging.
     """
 
-    kind: str = setting("http", "which link", choices=("http", "serial"))
+    kind: str = setting("http", "kind of link", choices=("http", "serial"))
     connect_s: float = setting(
-        3.0, "to connect; on a serial line to write, and for the agent's own answers", "s", above=0.0, below=30.0
+        3.0, "to connect; on a serial line to write, and for the agent's own replies", "s", above=0.0, below=30.0
     )
-    read_s: float = setting(20.0, "for a whole answer of the device", "s", above=0.0, below=30.0)
+    read_s: float = setting(20.0, "for a whole reply of the device", "s", above=0.0, below=30.0)
     floor_s: float = setting(
-        1.0, "no time-out is shorter in real seconds, however fast an emulator runs", "s", above=0.0, below=30.0
+        1.0, "shortest time-out in real seconds at any speed of an emulator", "s", above=0.0, below=30.0
     )
-    port: str = setting("/dev/ttyACM0", "serial device of this computer")
+    port: str = setting("/dev/ttyACM0", "serial port of this computer")
     token_file: str = setting(
-        "", "over HTTP through the board agent: file with a copy of the board's token, mode 600; '' without an agent"
+        "", "HTTP through the board agent: file with a copy of the board's token, mode 600; '': no agent"
     )
-    baud: int = setting(115200, "irrelevant on the USB gadget, right for the debug header", at_least=9600)
+    baud: int = setting(115200, "baud rate; no effect on the USB gadget, correct for the debug header", at_least=9600)
 
     def __post_init__(self) -> None:
         check(self, "transport")

@@ -26,10 +26,10 @@ def vial_ml(volume_ml: float) -> int:
 class UnitConfig:
     """What one unit has otherwise than `backend` says. Raises: ValueError naming key, value and allowed range."""
 
-    address: str = setting("", "of its web server, e.g. http://10.42.0.2; '': http://NAME.local")
-    channel: str | None = setting(None, "as backend.channel", choices=("1", "2", "3", "4"))
-    od_zero: float | None = setting(None, "as backend.od_zero", within=(-10, 10))
-    od_scale: float | None = setting(None, "as backend.od_scale", above=0.0, at_most=1000.0)
+    address: str = setting("", "address of the unit's web server, e.g. http://10.42.0.2; '': http://NAME.local")
+    channel: str | None = setting(None, "replaces backend.channel", choices=("1", "2", "3", "4"))
+    od_zero: float | None = setting(None, "replaces backend.od_zero", within=(-10, 10))
+    od_scale: float | None = setting(None, "replaces backend.od_scale", above=0.0, at_most=1000.0)
 
     def __post_init__(self) -> None:
         check(self, "backend.units.NAME")
@@ -40,34 +40,34 @@ class UnitConfig:
 class PioreactorConfig:
     """How to reach the units of a cluster, and what differs from other families. Raises: ValueError."""
 
-    kind: str = setting("pioreactor", "which backend")
-    reactors: tuple[str, ...] = setting(("pio01",), "names of the units, as in the vendor's page", some=True)
-    units: dict[str, UnitConfig] = setting({}, "what single units have otherwise, e.g. units.pio02.channel=1")
-    broker: str = setting("pioreactor.local", "host of the cluster's MQTT broker, its leader")
-    broker_port: int = setting(1883, "of the broker", within=(1, 65535))
-    username: str = setting("pioreactor", "of the broker")
-    password_file: str = setting("", f"file with its password, mode 600; '': {PASSWORD}, else the vendor's own")
-    tls: bool = setting(False, "encrypt the way to the broker")
-    ca_file: str = setting("", "certificate of who signed the broker's; '': those of this computer", note="with tls")
+    kind: str = setting("pioreactor", "backend")
+    reactors: tuple[str, ...] = setting(("pio01",), "names of the units as on the vendor's page", some=True)
+    units: dict[str, UnitConfig] = setting({}, "settings of single units, e.g. units.pio02.channel=1")
+    broker: str = setting("pioreactor.local", "host of the cluster's MQTT broker (the leader)")
+    broker_port: int = setting(1883, "port of the broker", within=(1, 65535))
+    username: str = setting("pioreactor", "user name at the broker")
+    password_file: str = setting("", f"file with the password, mode 600; '': {PASSWORD}, else the vendor's own")
+    tls: bool = setting(False, "encrypt the connection to the broker")
+    ca_file: str = setting("", "certificate authority of the broker; '': those of this computer", note="with tls")
     leader: str = setting("", "address of the leader's web server; '': http://BROKER")
-    experiment: str = setting("turbidostat", "name of the experiment in the vendor's pages and data")
-    speed: float = setting(1.0, "growth faster than real time, only in the rig", within=(1, 60))
+    experiment: str = setting("turbidostat", "name of the experiment on the vendor's pages")
+    speed: float = setting(1.0, "speed-up of growth; only on the test bench", within=(1, 60))
     reading_s: float = setting(5.0, "real time between the vendor's readings", "s", within=(1, 30))
-    window_s: float = setting(30.0, "a sample is the median of the readings of at most so long", "s", within=(5, 300))
-    mix_s: float = setting(5.0, "after a dose no reading counts for so long", "s", within=(0, 60))
-    channel: str = setting("2", "photodiode that shows the culture", choices=("1", "2", "3", "4"))
-    od_zero: float = setting(0.0, "reading of clear medium; 0 where a calibration is active", within=(-10, 10))
-    od_scale: float = setting(1.0, "OD per unit of reading; 1 where one is active", above=0.0, at_most=1000.0)
+    window_s: float = setting(30.0, "longest period of readings whose median is a sample", "s", within=(5, 300))
+    mix_s: float = setting(5.0, "time after a dose in which readings are ignored", "s", within=(0, 60))
+    channel: str = setting("2", "photodiode that measures the culture", choices=("1", "2", "3", "4"))
+    od_zero: float = setting(0.0, "reading of clear medium; 0 with an active calibration", within=(-10, 10))
+    od_scale: float = setting(1.0, "OD per unit of reading; 1 with an active calibration", above=0.0, at_most=1000.0)
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
-    thermostat: bool = setting(True, "run the vendor's thermostat; else temperatures are not controlled")
+    thermostat: bool = setting(True, "run the vendor's thermostat; otherwise temperatures are not controlled")
     stirring: bool = setting(True, "run the vendor's stirring")
-    min_dose_ml: float = setting(0.05, "less is put off to the next dose", "mL", within=(0, 1))
-    max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
-    waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
+    min_dose_ml: float = setting(0.05, "smallest dose; a smaller one is added to the next dose", "mL", within=(0, 1))
+    max_dose_ml: float = setting(1.5, "largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
+    waste_factor: float = setting(2.0, "waste volume over media volume, as in the vendor's automations", within=(1, 5))
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
-    alt_media: bool = setting(False, "the alt-media pump has a tube and a fluid of its own; signals call it pump 3")
-    start_s: float = setting(12.0, "real time in which an accepted dose must begin", "s", within=(2, 120))
-    stop_s: float = setting(30.0, "real time a stop tries to verify the pumps off", "s", within=(1, 600))
+    alt_media: bool = setting(False, "use the alt-media pump with a fluid of its own; signals call it pump 3")
+    start_s: float = setting(12.0, "real time within which an accepted dose must begin", "s", within=(2, 120))
+    stop_s: float = setting(30.0, "real time in which a stop tries to verify the pumps off", "s", within=(1, 600))
 
     def __post_init__(self) -> None:
         check(self, "backend")
@@ -109,11 +109,11 @@ class PioreactorConfig:
 class RigConfig:
     """Which software the rig runs, and what its vials are. Raises: ValueError naming key, value and allowed range."""
 
-    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
-    folder: str = setting("", "of the environments; empty: in the user's cache")
-    od: float = setting(0.7, "of the cultures at the start", "OD", within=(0.0, 4.0))
+    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or path of a wheel")
+    folder: str = setting("", "folder of the environments; empty: the user's cache")
+    od: float = setting(0.7, "OD of the cultures at the start", "OD", within=(0.0, 4.0))
     plant: str = setting("nominal", "preset of the cultures")
-    seed: int = setting(0, "of the vials", at_least=0)
+    seed: int = setting(0, "random seed of the vials", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "backend.rig")
@@ -123,8 +123,8 @@ class RigConfig:
 class RigBackendConfig(PioreactorConfig):
     """`backend=pioreactor_rig`: the same driver against the vendor's software around our vials, started for the run."""
 
-    kind: str = setting("pioreactor_rig", "which backend")
-    speed: float = setting(10.0, "growth faster than real time: device seconds per real second", within=(1, 60))
+    kind: str = setting("pioreactor_rig", "backend")
+    speed: float = setting(10.0, "speed-up of growth: device seconds per real second", within=(1, 60))
     reactors: tuple[str, ...] = setting(("pio01", "pio02"), "names of the units", some=True)
     reading_s: float = setting(1.0, "real time between the vendor's readings", "s", within=(1, 30))
     rig: RigConfig = part(RigConfig, "the software and the vials")

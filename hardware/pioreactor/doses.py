@@ -56,14 +56,14 @@ class Doses:
     """The doses of one unit, one at a time, at most one per sample.
 
     Attributes: ended_s, real time at which the last was over; foreign, what was dosed without our command; extra, what
-      was given beyond what was booked when doses began, until somebody books and clears it.
+      was given beyond what was booked when doses began, until that is booked; refused, why each of the last gave none.
     """
 
     def __init__(self, pumps: Pumps) -> None:
         self.pumps, self._book, self._config, self._clock = pumps, pumps.book, pumps.config, pumps.clock
         self.ended_s = self._due = -math.inf
         self.extra: list[Given] = []
-        self.foreign = ""
+        self.foreign, self.refused = "", list[str]()
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
         self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
@@ -119,13 +119,12 @@ class Doses:
         return plan
 
     def _obstacle(self, sample: tuple[float, int] | None) -> str:
-        if sample is None or sample == self.sample:
-            return "no new sample"
-        if self.running:
-            return "the previous dose has not ended"
-        if self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS):
-            return "a pump or a dosing job of somebody else runs"
-        return ""
+        stands = {
+            "no new sample": sample is None or sample == self.sample,
+            "the previous dose has not ended": self.running,
+            "a pump or a dosing job of somebody else runs": self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS),
+        }
+        return next((why for why, holds in stands.items() if holds), "")
 
     def work(self) -> None:
         """Do what is due; called again and again."""
@@ -187,6 +186,7 @@ class Doses:
             if moved.end:
                 self._book.tell(f"{NAMES[job]}: {moved.end}")
         taken_ml, end = self._taken_ml, media.end or waste.end
+        self.refused = [*self.refused, media.end] if media.end and not media.high else []
         row = Ending(on_s, media.high, taken_ml + waste.low, pump=NUMBERS[self._job], feed_low_ml=media.low).row()
         self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=end)
         self._ran_on = self._ran_on or media.high > plan.feed_ml + LATE_ML

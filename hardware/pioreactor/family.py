@@ -52,7 +52,7 @@ class PioreactorFamily(Family):
         """As the family says, and a new run is checked first. Raises: ReactorError."""
         earlier, began = opening.earlier(), opening.began
         with ExitStack() as stack:
-            with not_looked_at():
+            with not_looked_at(opening.resumed):
                 run = next((str(row["run"]) for row in earlier if row.get("run")), format(int(began), "x"))
                 units = self.units(opening.backend, opening.bench, opening.folder, opening.journal.append, run)
                 reactors = stack.enter_context(units)

@@ -136,11 +136,9 @@ class Pumps:
         """Whether the unit was started again, by its list of running jobs."""
         return boot_of(rows) not in ("", self.boot)
 
-    @property
-    def locks(self) -> str:
-        """What to do about a lock that a killed process left."""
-        word = f"{self.facts.purge} pwm_locks PIN --as-int (pins {', '.join(map(str, self.config.pump_pins))})"
-        return f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word}"
+    def unlock(self, job: str) -> str:
+        """Return the command that frees a pump's pin of the lock that a killed process left."""
+        return f"on the unit: {self.facts.purge} pwm_locks {self.box.jobs[job]} --as-int"
 
     def named(self, job: str) -> str:
         """Name a pump, and the pin behind it."""
@@ -256,7 +254,7 @@ class Pumps:
             if state.word == "disconnected" and state.at >= asked_s:
                 never_s = min(never_s, state.at + SETTLE_S)
             if now > never_s and not self.box.live(job):
-                why = f"accepted and not carried out: {self.locks}"
+                why = f"accepted and not carried out; if its log names a lock on the pin, {self.unlock(job)}"
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
             if job in self.barred and calls.due("stop", 1.0):  # heard once the job listens
@@ -304,12 +302,11 @@ class Pumps:
             if late:
                 ended = "which lost the broker" if self.broke(request) else "which should have ended"
                 how = "whose process was killed or stands still" if ending.lost else ended
-                off = f"or on the unit: {self.facts.purge} pwm_locks {self.box.jobs[job]} --as-int"
                 if heard and self.told_on(job):
-                    self.trouble = f"{self.named(job)} runs on after {job}, {how}; pull its plug, {off}"
+                    self.trouble = f"{self.named(job)} runs on after {job}, {how}; pull its plug, or {self.unlock(job)}"
                 elif ending.failed:
                     look = "look at it; if it runs, pull its plug"
-                    self.trouble = f"{self.named(job)} may run on after {job}, {how}; {look}, {off}"
+                    self.trouble = f"{self.named(job)} may run on after {job}, {how}; {look}, or {self.unlock(job)}"
                 else:
                     self.trouble = f"{self.named(job)} is being verified off after {job}, {how}"
             self.waits = late or self.waits

@@ -47,7 +47,7 @@ class PioreactorStation:
         self._answer = self._pumps.answer
         self.sampling = UnitSampling(unit.config, unit.bench.period_s, self._clock.now())
         self.regulated_od = self._target = self.level_ml = math.nan
-        self.given_up = self.heat_is_off = self.up = False
+        self.given_up = self.heat_is_off = self.up = self._listened = False
         self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
         self._course: Iterator[float] | None = None
         self._gone, self._been, self._ended = set[str](), set[str](), set[str]()
@@ -97,6 +97,7 @@ class PioreactorStation:
                     self._pumps.ask_pins()
                 yield STEP_S
             yield from self._end_job(STIR) if own else ()
+        self._listened = True
 
     def lie_down(self, error: ReactorError, history: UnitHistory) -> None:
         """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
@@ -141,6 +142,10 @@ class PioreactorStation:
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
                 self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
+            for job in PUMPS:  # a broker that was killed may say again what was retained long before
+                old = self._box.live(job) and self._box.state(job).at < self._real.now() - GRACE_S
+                if old and job not in self._listed and not self.doses.running:
+                    self._box.take(f"pioreactor/{self.name}/{self._config.experiment}/{job}/$state", b"lost", False)
         if said := self._leads.ask("assigned", GRACE_S / 2.0, self.unit.leader.astray, self.name):
             self._astray = said[0]
         unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
@@ -204,15 +209,16 @@ class PioreactorStation:
             again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
             what, remedy = f"the unit {GONE[job]}", f"{again}; a killed job blocks restarts, on the unit: {word}"
             if job == OD and (said := self._box.complaint):
-                what, remedy = f"{what}, its log says: {said}", "do what that says; doses wait"
+                what, remedy = f"{what}, its log says: {said}", "do what that says, else reboot the unit; doses wait"
             elif self._real.now() > self._box.heard_s + SILENT_S:
                 what, remedy = f"{what}, nor says anything", f"look at its power and network; {again}"
             return Fault("stopped", what, remedy)
-        if math.isinf(self._box.dc_s):
+        if self._listened and math.isinf(self._box.dc_s):
             return Fault("pump", UNHEARD, "stop and start stirring in the vendor's page, else reboot the unit")
         since_s, why = self._calls.failed.get("rows", (math.inf, ""))
-        late = self._real.now() > since_s + GRACE_S
-        return Fault("link", f"its web server: {why}", "doses wait") if late else None
+        if self._real.now() > since_s + GRACE_S:
+            return Fault("link", f"its web server: {why}", "doses wait")
+        return Fault("undosed", self.doses.refused[-1], "tried again") if self.doses.refused[1:] else None
 
     def _wanted(self) -> list[str]:
         """List the jobs that this run keeps going."""
@@ -250,15 +256,14 @@ class PioreactorStation:
 
     def dose(self, rate: float, pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
-        refusal = ""
-        if self.given_up:
-            refusal = "the unit was given up"
-        elif self.handed_over:
-            refusal = "the unit regulates itself"
-        elif self.book.fault is not None:
-            refusal = str(self.book.fault)
-        elif self._clock.now() - self.sampling.at > self.unit.bench.stale_s:
-            refusal = "its sample is stale"
+        stands = {
+            "the unit was given up": self.given_up,
+            "the unit regulates itself": self.handed_over,
+            str(self.book.fault): self.book.fault is not None and self.book.fault.kind != "undosed",
+            "its sample is stale": self._clock.now() - self.sampling.at > self.unit.bench.stale_s,
+            UNHEARD: math.isinf(self._box.dc_s),
+        }
+        refusal = next((why for why, holds in stands.items() if holds), "")
         key = (round(self.sampling.at, 3), self.sampling.count) if self.sampling.count else None
         plan = self.doses.begin(rate, key, refusal, pump)
         self.doses.foreign = ""
@@ -298,7 +303,7 @@ class PioreactorStation:
                     on = [pumps.named(job) for job in PUMPS if heard and pumps.told_on(job)]
                     off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
                     seen = f"{on[0]} on; pull its plug" if on else f"not verified off; {off}"
-                    why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"
+                    why = (pumps.trouble or "look at the unit's log") if self._mqtt.connected else "no broker to ask"
                     raise DeviceStateError(f"pumps of {self.name}: {seen}. {why}")
                 self.go_on()
                 yield STEP_S

@@ -113,11 +113,11 @@ class Responses:
     """
 
     budget: str = setting(RESPONSES["budget"], "a feed budget is used up", choices=tuple(WORDS)[1:])
-    jump: str = setting(RESPONSES["jump"], "a step that neither growth nor dose explains", choices=NOT_REGULATE)
-    no_dilution: str = setting(RESPONSES["no_dilution"], "the pump ran but OD did not fall", choices=NOT_REGULATE)
-    falls: str = setting(RESPONSES["falls"], "OD falls without pump", choices=NOT_REGULATE[1:])
+    jump: str = setting(RESPONSES["jump"], "a step that neither growth nor a dose explains", choices=NOT_REGULATE)
+    no_dilution: str = setting(RESPONSES["no_dilution"], "the pump ran but the OD did not fall", choices=NOT_REGULATE)
+    falls: str = setting(RESPONSES["falls"], "the OD falls without a dose", choices=NOT_REGULATE[1:])
     fluorescence_lost: str = setting(
-        RESPONSES["fluorescence_lost"], "no believed fluorescence for more than light_lost minutes",
+        RESPONSES["fluorescence_lost"], "no valid fluorescence for more than light_lost minutes",
         choices=tuple(WORDS),
     )  # fmt: skip
 
@@ -131,53 +131,53 @@ class SafetyConfig:
 
     ml_per_minute: float | None = setting(
         None,
-        "feed budget; null: two and a half of the largest doses, since two may fall into 60 s when a sample is late",
+        "feed budget per minute; null: 2.5 of the largest doses, since 60 s can contain two",
         "mL",
         above=0.0,
         below=math.inf,
     )
-    ml_per_hour: float = setting(75.0, "feed budget", "mL", above=0.0, below=math.inf)
-    ml_per_run: float = setting(10000.0, "feed budget", "mL", above=0.0, below=math.inf)
+    ml_per_hour: float = setting(75.0, "feed budget per hour", "mL", above=0.0, below=math.inf)
+    ml_per_run: float = setting(10000.0, "feed budget per run", "mL", above=0.0, below=math.inf)
     overflow_ml: float = setting(
-        5.0, "so much above the waste tube is an overflow, and whatever a vial cannot hold", "mL", within=(0, 10)
+        5.0, "volume above the waste tube that counts as an overflow, also limited by the vial", "mL", within=(0, 10)
     )
-    od_min: float = setting(-0.1, "readings below are impossible", "OD", within=(-1, 0.05))
-    od_max: float = setting(4.0, "readings above are impossible", "OD", within=(MAX_SETPOINT, 10))
-    mu_max: float = setting(0.04, "no culture grows faster (LB at 37 degC: 0.031)", "1/min", within=(0.001, 0.1))
-    death: float = setting(0.005, "fastest decline without a dose", "1/min", within=(0, 0.1))
+    od_min: float = setting(-0.1, "lowest possible reading", "OD", within=(-1, 0.05))
+    od_max: float = setting(4.0, "highest possible reading", "OD", within=(MAX_SETPOINT, 10))
+    mu_max: float = setting(0.04, "fastest possible growth (LB at 37 degC: 0.031)", "1/min", within=(0.001, 0.1))
+    death: float = setting(0.005, "fastest possible decline without a dose", "1/min", within=(0, 0.1))
     jump: float = setting(
-        0.04, "a step beyond growth and dose of more than this is no culture", "OD", above=0.0, below=math.inf
+        0.04, "largest step that is not explained by growth and dose", "OD", above=0.0, below=math.inf
     )
     jump_fraction: float = setting(
-        0.08, "or of more than this fraction of OD; 0.6 % of readings are such outliers", within=(0, 1)
+        0.08, "the same as a fraction of the OD; 0.6 % of readings are such outliers", within=(0, 1)
     )
     drift: float = setting(
         0.05,
-        "unexplained change of ln OD, on top of six sd of the sensor, that in three samples in a row trips "
-        "no_dilution or falls",
+        "unexplained change of ln OD, beyond six sd of the sensor, that causes no_dilution or falls if three samples "
+        "in a row show it",
         within=(0.01, 1),
     )
-    noise_od: float = setting(0.005, "sd of the sensor", "OD", within=(0, 0.5))
-    noise_fraction: float = setting(0.005, "its part that is proportional to OD", within=(0, 0.5))
-    cooldown: float = setting(5.0, "without a dose after no_dilution or falls", "min", above=0.0, below=math.inf)
+    noise_od: float = setting(0.005, "constant part of the sensor's sd", "OD", within=(0, 0.5))
+    noise_fraction: float = setting(0.005, "part of the sensor's sd that is proportional to the OD", within=(0, 0.5))
+    cooldown: float = setting(5.0, "time without a dose after no_dilution or falls", "min", above=0.0, below=math.inf)
     stale_s: float | None = setting(
-        None, "age of a newest sample that is stale; null: 40 s more than a control period", "s", at_most=7200.0
+        None, "age at which the newest sample is stale; null: a control period plus 40 s", "s", at_most=7200.0
     )
-    lost_s: float | None = setting(None, "and that is lost; null: three control periods", "s", at_most=14400.0)
-    silent: float = setting(120.0, "after which a reactor is given up", "min", above=0.0, below=math.inf)
+    lost_s: float | None = setting(None, "age at which it is lost; null: three control periods", "s", at_most=14400.0)
+    silent: float = setting(120.0, "silence after which the run ends a reactor", "min", above=0.0, below=math.inf)
     cooling: float = setting(
         90.0, "slowest time constant of cooling to a lower target", "min", above=0.0, below=math.inf
     )
     light_min: float = setting(1.0, "fluorescence below is a dead LED or spectrometer", "counts", within=(0, 65534))
-    frozen_light: int = setting(5, "equal readings of fluorescence in a row that no noisy sensor gives", within=(2, 60))
+    frozen_light: int = setting(5, "equal fluorescence readings in a row that count as frozen", within=(2, 60))
     light_lost: float = setting(
-        15.0, "without a believed fluorescence, then that is said until it comes back", "min", above=0.0, below=math.inf
+        15.0, "time without a valid fluorescence until it is reported", "min", above=0.0, below=math.inf
     )
     composition_low: float = setting(
-        29.0, "lowest target that a composition controller may set; composition_high or less", "degC", within=(15, 42)
+        29.0, "lowest target of a composition controller; composition_high or less", "degC", within=(15, 42)
     )
-    composition_high: float = setting(36.0, "and highest", "degC", within=(15, 42))
-    controller_patience: int = setting(5, "unusable proposals in a row: the controller is lost", within=(1, 60))
+    composition_high: float = setting(36.0, "highest target of a composition controller", "degC", within=(15, 42))
+    controller_patience: int = setting(5, "unusable proposals in a row until it counts as failed", within=(1, 60))
     responses: Responses = part(
         Responses, "what is done about some reasons; about all others what docs/three_am.md says"
     )

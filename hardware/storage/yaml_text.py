@@ -4,9 +4,17 @@ from pathlib import Path
 
 import yaml  # type: ignore[import-untyped]
 
-__all__ = ["read_text"]
+__all__ = ["problem", "read_text"]
 
 LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours have a tenth and a third of it
+
+
+def problem(error: Exception) -> str:
+    """Say what is wrong with a text and in which line, in one line."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is not None and isinstance(error, yaml.MarkedYAMLError):
+        return f"{error.problem} in line {mark.line + 1}"
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def read_text(path: Path | str) -> str:
@@ -32,5 +40,5 @@ def read_text(path: Path | str) -> str:
     except ValueError:
         raise
     except Exception as error:  # whatever PyYAML meets
-        raise ValueError(f"not YAML ({str(error).splitlines()[0]})") from None
+        raise ValueError(f"not YAML ({problem(error)})") from None
     return text

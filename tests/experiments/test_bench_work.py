@@ -284,7 +284,7 @@ def test_a_culture_is_no_blank(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("what", "content", "words"),
     [
-        ("feed", "{", "not readable"), ("feed", "- 1", "no keys"), ("feed", "flow_ml_s: fast", "could not convert"),
+        ("feed", "{", "not readable"), ("feed", "- 1", "no keys"), ("feed", "flow_ml_s: fast", "flow_ml_s = fast"),
         ("feed", "flow_ml_s: 70", "flow_ml_s = 70"), ("blank", "blank: 13.0", "blank = 13"),
     ],
 )  # fmt: skip

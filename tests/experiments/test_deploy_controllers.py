@@ -34,6 +34,7 @@ from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.family import EmulatorFamily
 from hardware.emulator.transport import EmulatorTransport
+from hardware.errors import LinkError
 from hardware.family import Opening, family
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.family import PioreactorFamily
@@ -145,12 +146,19 @@ def test_the_paper_s_rival_on_an_emulated_device_behind_a_real_socket(tmp_path: 
 
 
 @pytest.mark.parametrize(("kind", "first"), [(EmulatorFamily, "linked"), (PioreactorFamily, "units")])
-def test_a_stop_before_the_pumps_were_looked_at_says_so(kind: Any, first: str, tmp_path: Path, monkeypatch, caplog):
-    """Ctrl-C at the first request, by which the device is found: what an earlier life left on may run on."""
-    monkeypatch.setattr(kind, first, Mock(side_effect=KeyboardInterrupt))
+@pytest.mark.parametrize(
+    ("error", "resumed", "said"),
+    [(KeyboardInterrupt, False, True), (LinkError, True, True), (LinkError, False, False)],
+)
+def test_an_end_before_the_pumps_were_looked_at_says_so(
+    kind: Any, first: str, error: Any, resumed: bool, said: bool, tmp_path: Path, monkeypatch, caplog
+):
+    """At the first request, by which the device is found: what an earlier life left on may run on."""
+    monkeypatch.setattr(kind, first, Mock(side_effect=error))
     backend = EmulatorConfig() if kind is EmulatorFamily else PioreactorConfig()
     with closing(Journal(tmp_path / "journal.jsonl", fsync=False)) as journal:
-        opening = Opening(backend, Bench(), PlantConfig(), journal, tmp_path, resumed=False)
-        with pytest.raises(KeyboardInterrupt), kind().open(opening):
+        journal.rows = [{"wall": 0.0}] * resumed
+        opening = Opening(backend, Bench(), PlantConfig(), journal, tmp_path, resumed=resumed)
+        with pytest.raises(error), kind().open(opening):
             pass
-    assert "pumps not verified off" in caplog.text
+    assert ("pumps not verified off" in caplog.text) == said

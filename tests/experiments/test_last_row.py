@@ -1,14 +1,17 @@
 """The end of a run: what its last doses came to, a recording that is gone, a run that another program is at."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from experiments.control import run as control
 from experiments.record.record import Record
+from experiments.record.recovery import Rows, at_end
 from experiments.record.summary import ChangeLog
 from hardware.emulator.faults import inject
 from hardware.errors import RecordingError
+from hardware.storage.doses import Ending
 from tests.experiments.test_open_dose import in_a_dose
 
 
@@ -33,6 +36,17 @@ def test_what_was_repeated_after_the_last_row_is_in_it_and_once_however_often_th
         while not run.device.apps["M0"].data["Pump1"]["ON"]:
             run.loop.step()
     run.close()
+
+
+def test_with_its_last_row_a_recording_has_what_its_journal_has_of_each_dose() -> None:
+    journal, rows = list[dict[str, Any]](), Rows()
+    for at, ml, written_ml in ((0.0, 1.2, 1.2), (60.0, 0.0, 1.2), (120.0, 0.0, 0.0)):
+        rows.append(cells := dict.fromkeys(rows.names, 0.0) | {"time_min": at / 60.0, "volume_ml": written_ml})
+        asked, end = {"on_s": at, "feed_ml": 1.2, "waste_ml": 0.0}, Ending(at, ml, 0.0).row()
+        told = {"decision": {"row": cells}, "intent": asked, "feed_on": {}, "dose_end": end}
+        journal += [{**told[kind], "reactor": "M0", "kind": kind, "n": len(journal) + k} for k, kind in enumerate(told)]
+    last = at_end(journal, "M0", rows) or {}
+    assert sum(rows.columns["volume_ml"][:-1]) + float(last.get("volume_ml") or 0.0) == pytest.approx(1.2)
 
 
 def test_a_run_that_is_under_way_is_left_as_it_is(tmp_path: Path) -> None:

@@ -17,13 +17,16 @@ from hardware.errors import DeviceStateError, ProtocolError
 from tests.programs import Program, run
 
 
-def test_a_second_master_is_refused_under_another_name_of_the_device() -> None:
+def test_a_second_master_is_refused_under_another_name_of_the_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with EmulatorProcess(["--speed", "100", "--reactors", "M1,M2"]) as device:
         by_number = ChiBioConfig(url=device.url, speed=100.0, reactors=("M1",))
         by_name = ChiBioConfig(url=device.url.replace("127.0.0.1", "localhost"), speed=100.0, reactors=("M2",))
         refusal = pytest.raises(DeviceStateError, match=f"already controlled by process {os.getpid()}: one client per")
-        with linked(by_number), refusal, linked(by_name):
-            pass
+        with linked(by_number), refusal:
+            monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # as of another user
+            linked(by_name).__enter__()
         with linked(by_name):
             pass
 

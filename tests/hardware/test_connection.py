@@ -49,18 +49,19 @@ def at(sample_s: float, cycles: int, started: str = "2026-01-01 00:00:00") -> St
 
 CASES: dict[str, tuple[Steps, list[Act]]] = {
     "another unit at this position, and whatever stands there now is not ours": (
-        read(state()) + read(state(DeviceID="other")),
-        [READ, (IdentityError, "pinned", "read"), (*UNSEEN, OFF[0])],
+        [*read(state()), *read(state(DeviceID="garbled")), *read(state()), *(3 * read(state(DeviceID="other")))],
+        [READ, READ, (IdentityError, "pinned", "read"), (*UNSEEN, OFF[0])],
     ),
     "an answer of an earlier time comes again, by its record or its count of cycles": (
         [*at(120.3, 3), *at(60.2, 3), *at(120.3, 2), *at(120.3, 3), *at(0.07, 1, "2026-01-02 00:00:00")],
         [READ, *(2 * [(LinkError, "earlier time", "read")]), READ, READ],
     ),
+    "a board's clock that went back by an hour, with winter time": ([*at(3780.3, 64), *at(240.4, 65)], [READ, READ]),
     "another client's selection: the pair is repeated": (2 * read(state("M1")) + read(state()), [READ]),
     "a client that keeps selecting": (3 * read(state("M1")), [(DeviceStateError, "another client", "read")]),
     "absent": (read(state(presentDevices=NO_M0)), [(*ABSENT, "read"), *((*UNSEEN, path) for path in OFF)]),
     "before the first read": ([], [(*UNSEEN, OFF[0])]),
-    "no identity": (read(state(DeviceID="")), [(IdentityError, "none", "read")]),
+    "no identity": (3 * read(state(DeviceID="")), [(IdentityError, "none", "read")]),
     "a lost answer: presence is looked at before the next command": after_a_refusal(LOST),
     "a board agent without a server: alike": after_a_refusal(Reply(502, b"the board agent finds no server")),
     "a while without a request: presence is looked at before the next command": (

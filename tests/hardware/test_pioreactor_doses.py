@@ -111,6 +111,22 @@ def test_each_dose_of_somebody_else_is_counted_once_as_what_it_is_and_holds_ours
     assert not lab.of("dose_end")
 
 
+def test_a_pump_that_a_lock_keeps_off_is_told_with_its_command_and_tried_again(lab):
+    lab.world.locks.add(MEDIA_PIN)  # as a full disk leaves it
+    for told in ([], ["undosed"], []):
+        lab.sample()
+        assert lab.dose(0.5) == 0.5
+        lab.wait(8.0)
+        assert [fault.kind for fault in [lab.fault] if fault and "pwm_locks 13" in fault.detail] == told
+        lab.world.locks -= {MEDIA_PIN} if told else set()
+
+
+def test_a_retained_word_of_a_pump_that_its_unit_does_not_list_holds_doses_for_a_while_only(lab):
+    lab.world.say("add_media/$state", "ready", retained=True)
+    lab.wait(60.0)
+    assert lab.dose(0.5) == 0.5
+
+
 @pytest.mark.parametrize("retained", [False, True])
 def test_a_retained_duty_of_another_experiment_is_no_pump_of_ours(monkeypatch, retained):
     lab = Lab(monkeypatch)
@@ -302,7 +318,7 @@ def test_after_a_resume_nobody_is_told_to_pull_a_plug_while_no_pump_is_told_on(m
     told = []
     again.until(lambda: told.append(str(again.fault)) or not again.station.doses.running, 15.0)
     again.until(lambda: told.extend(again.reactors.pumps_off(np.array([True]))) or again.fault is None, 1.0)
-    assert not [line for line in told if "plug" in line]
+    assert not [line for line in told if "plug" in line or "stirring" in line]
     again.sample()
     assert again.dose(0.5) == 0.5
 

@@ -372,7 +372,7 @@ def test_a_reader_that_publishes_nothing_is_told_with_what_its_log_says(monkeypa
     lab.world.say("logs/app/error", json.dumps({**said, "task": "stirring", "message": "no reading of the rpm"}))
     lab.world.say("logs/app/error", json.dumps(said))
     lab.until(lambda: lab.fault is not None, 60.0)
-    assert (lab.fault.kind, BELOW in lab.fault.detail) == ("stopped", True)
+    assert (lab.fault.kind, BELOW in lab.fault.detail, "reboot" in lab.fault.remedy) == ("stopped", True, True)
     lab.world.od_s, lab.world.od_alive = 5.0, True
     lab.world._read()
     lab.until(lambda: lab.fault is None, 60.0)

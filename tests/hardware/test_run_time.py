@@ -1,12 +1,13 @@
 """The time of a run that is resumed: by its journal, this computer's clocks and the device's cycles."""
 
 import json
+import time
 from typing import Any
 
 import pytest
 
 from hardware.chibio.resume import replay
-from hardware.clock import run_time
+from hardware.clock import DeviceClock, run_time
 from hardware.storage.doses import dosed
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import quiet
@@ -32,6 +33,14 @@ def lab() -> Killed:
     lab.step()
     assert replay(lab.rows)["M0"].open or replay(lab.rows)["M1"].open
     return lab
+
+
+def test_a_clock_goes_on_while_the_computer_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else nobody knows of the doses that a device repeats meanwhile."""
+    clock = DeviceClock(2.0)
+    awake, before_s = time.clock_gettime, clock.now()
+    monkeypatch.setattr("time.clock_gettime", lambda which: awake(which) + 420.0 * (which == time.CLOCK_BOOTTIME))
+    assert clock.now() - before_s >= 840.0
 
 
 def computer(monkeypatch: pytest.MonkeyPatch, lab: Killed, step_s: float, boot: str) -> None:

@@ -229,3 +229,15 @@ def test_one_time_out_now_and_then_rests_no_reactor():
         link.get("/x/M0")
         clock.sleep(3600.0)
     assert len(asked) == 4
+
+
+def test_a_board_whose_clock_goes_back_by_an_hour_is_dosed_on_and_not_stirred_while_it_measures() -> None:
+    lab = begun(options=quiet(mu=0.025), rate=0.008, minutes=5.0)
+    lab.clock.sleep(30.0)  # to where a cycle only waits
+    lab.fault("clock_step", -3600.0)
+    before = len(lab.wire.posts)
+    lab.run(6)
+    posts = [path for _, path in lab.wire.posts[before:]]
+    assert posts.count("/SetOutputOn/Pump1/1/M0") >= 3
+    assert not any("/Stir/" in path for path in posts)
+    assert "jump" not in lab.kinds()

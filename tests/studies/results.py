@@ -5,8 +5,8 @@
   python -m tests.studies.results NAME=RUN/week.json the same of another table of the run
   python -m tests.studies.results NAME=RUN/tables/X.csv  the same of a table of a report
 
-A table stands between `<!-- result NAME -->` and `<!-- end -->`; its file holds columns and rows as they are shown,
-and command, commit and date of the run.
+A table stands between `<!-- result NAME -->` and `<!-- end -->`, or the page links to `results/NAME.json`. The file
+holds columns and rows as they are shown, and command, commit and date of the run.
 """
 
 import csv
@@ -23,10 +23,18 @@ from experiments.cli import files
 from experiments.cli.files import given
 from experiments.reporting.tables import markdown
 
-__all__ = ["adopt", "differences", "leave", "main", "write_csv"]
+__all__ = ["adopt", "differences", "leave", "main", "write", "write_csv"]
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+LINK = re.compile(r"\(\.\./results/(\w+)\.json\)")
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a table as JSON, one row a line."""
+    head = json.dumps({**content, "rows": []}, ensure_ascii=False).removesuffix("]}")
+    lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in content["rows"])
+    path.write_text(f"{head}\n{lines}\n]}}\n", encoding="utf-8")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -65,6 +73,7 @@ def differences(docs: Path) -> list[str]:
     stored = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted((docs / "results").glob("*.json"))}
     found, used = [], set()
     for page in sorted(docs.rglob("*.md")):
+        used.update(LINK.findall(page.read_text("utf-8")))
         for _, name, text, _ in BLOCK.findall(page.read_text("utf-8")):
             used.add(name)
             if name not in stored:
@@ -96,7 +105,7 @@ def adopt(docs: Path, name: str, run: Path) -> None:
     table = of_report(path) if path.suffix == ".csv" else json.loads(path.read_text("utf-8"))
     content = {key: table[key] for key in ("command", "commit", "date", "columns", "rows")}
     (docs / "results").mkdir(exist_ok=True)
-    files.write_json(docs / "results" / f"{name}.json", content)
+    write(docs / "results" / f"{name}.json", content)
     for page in docs.rglob("*.md"):
         text = page.read_text("utf-8")
         new = BLOCK.sub(lambda m: m[1] + shown(content) + m[4] if m[2] == name else m[0], text)

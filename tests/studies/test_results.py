@@ -33,6 +33,8 @@ def test_a_run_s_table_comes_to_its_place_and_what_differs_is_named(
     assert results.differences(docs) == [f"{page.name}: result one: the page is not what docs/results/one.json says"]
     page.write_text("# A\n")
     assert results.differences(docs) == ["docs/results/one.json: on no page"]
+    page.write_text("[rows](../results/one.json)\n")
+    assert not results.differences(docs)
     other = run / "week.json"
     other.write_text(json.dumps(left | {"rows": [["day", "1"]]}))
     page.write_text("# A\n<!-- result one -->\n<!-- end -->\n")

@@ -2,7 +2,7 @@
 
 A name stands for every fault that contains it; `planted` are those that the judge must find. Writes outcomes.json.
 `python -m tests.vendor table=[FOLDER,...]` writes the newest outcome of each fault below these folders, app beside
-emulator, into docs/records/vendor_app.md.
+emulator, to docs/results/vendor_app.json.
 """
 
 import json
@@ -13,15 +13,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+from tests.studies.results import write
 from tests.vendor.bench import BENCHES, ROOT, missing
 from tests.vendor.faults import FAULTS, PLANTED, Fault, play
 
-PAGE = ROOT / "docs" / "records" / "vendor_app.md"
-BEGIN, END = "<!-- vendor's app -->\n", "<!-- end -->"
-HEADER = """\
-| fault | told after, s | in the words | booked of true volume, mL, app | emulator | app | emulator |
-|---|---|---|---|---|---|---|
-"""
+RESULT = ROOT / "docs" / "results" / "vendor_app.json"
+COLUMNS = ("fault", "told after, s", "by", "booked of true volume, mL, app", "emulator", "app", "emulator")
 
 
 def listed(words: str) -> list[str]:
@@ -53,24 +50,22 @@ def volumes(outcome: dict[str, Any] | None) -> str:
     return ", ".join(f"{m['booked']:.1f} of {m['true']:.1f}" for m in each) or "–"
 
 
-def row(name: str, app: dict[str, Any] | None, emulator: dict[str, Any] | None) -> str:
-    """One line of the table."""
-    said = next((o["words"] for o in (app, emulator) if o and o["words"]), "")
-    words = f"`{said.partition(': ')[2].replace('|', '/')[:60]}`" if said else "–"
+def row(name: str, app: dict[str, Any] | None, emulator: dict[str, Any] | None) -> list[str]:
+    """Return one line of the table. An alarm is named by its reason, a message of the driver is a note."""
+    said = next((o["words"] for o in (app, emulator) if o and o["words"]), "").partition(": ")[2]
+    by = (said.split(":")[0] if ":" in said.split(" ")[0] else "note") if said else "–"
     after = told(app) if told(app) == told(emulator) else f"{told(app)}, {told(emulator)}"
-    cells = [name, after, words, volumes(app), volumes(emulator), verdict(app), verdict(emulator)]
-    return f"| {' | '.join(cells)} |"
+    return [name, after, by, volumes(app), volumes(emulator), verdict(app), verdict(emulator)]
 
 
-def table(folders: list[str]) -> str:
-    """Every fault's newest outcome on each bench, Markdown."""
+def table(folders: list[str]) -> list[list[str]]:
+    """Return every fault's newest outcome on each bench."""
     newest: dict[tuple[str, str], dict[str, Any]] = {}
     paths = [path for folder in folders for path in Path(folder).rglob("outcome.json")]
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
         outcome = json.loads(path.read_text())
         newest[outcome["name"], outcome["bench"]] = outcome
-    rows = [row(f.name, *(newest.get((f.name, kind)) for kind in BENCHES)) for f in FAULTS + PLANTED]
-    return HEADER + "\n".join(rows) + "\n"
+    return [row(f.name, *(newest.get((f.name, kind)) for kind in BENCHES)) for f in FAULTS + PLANTED]
 
 
 def main(arguments: list[str]) -> int:
@@ -78,8 +73,8 @@ def main(arguments: list[str]) -> int:
     out = Path(given.get("out", f"runs/vendor/{time.strftime('%Y-%m-%d_%H-%M-%S')}")).resolve()
     kind = given.get("bench", "app")
     if "table" in given:
-        before, _, rest = PAGE.read_text().partition(BEGIN)
-        PAGE.write_text(before + BEGIN + "\n" + table(listed(given["table"])) + "\n" + END + rest.partition(END)[2])
+        origin = {"command": f"python -m tests.vendor table={given['table']}", "date": time.strftime("%Y-%m-%d")}
+        write(RESULT, {**origin, "columns": COLUMNS, "rows": table(listed(given["table"]))})
         return 0
     if kind == "app" and (reason := missing()):
         print(reason)

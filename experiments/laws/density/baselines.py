@@ -17,9 +17,9 @@ LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this one: it has a log
 class ThresholdConfig(ControllerConfig):
     """A rate above the setpoint, none below."""
 
-    kind: str = setting("threshold", "which controller")
-    rate: float = setting(MAX_PUMP_RATE, "while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
-    hysteresis: float = setting(0.0, "OD below the setpoint at which it stops again", "OD", within=(0, 0.2))
+    kind: str = setting("threshold", "controller")
+    rate: float = setting(MAX_PUMP_RATE, "rate while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
+    hysteresis: float = setting(0.0, "distance below the setpoint at which the pump stops", "OD", within=(0, 0.2))
 
 
 class Threshold:
@@ -47,11 +47,11 @@ class Threshold:
 class GainScheduledConfig(ControllerConfig):
     """The table: growth rate and proportional gain at each temperature. By default mu falls as in the paper."""
 
-    kind: str = setting("gain_scheduled", "which controller")
+    kind: str = setting("gain_scheduled", "controller")
     temperatures: tuple[float, ...] = setting((30.0, 37.0), "of the table, rising", "degC", within=(0, 60), some=True)
     mu: tuple[float, ...] = setting((0.027, 0.03), "growth rate at each temperature", "1/min", within=(0, 0.1))
     gain: tuple[float, ...] = setting(
-        (0.5, 0.5), "part of ln(x/r) to remove in one control period, at each temperature", within=(0, 2)
+        (0.5, 0.5), "fraction of ln(x/r) to remove in one control period, at each temperature", within=(0, 2)
     )
 
     def __post_init__(self) -> None:
@@ -105,7 +105,7 @@ class GainScheduled:
 class HoldConfig(ControllerConfig):
     """A constant rate. mu tau of the model holds any OD if the model is true."""
 
-    kind: str = setting("hold", "which controller")
+    kind: str = setting("hold", "controller")
     rate: float | None = setting(
         None, "pump rate; null: mu tau of the model, 0.01 for the nominal one", "mL/s", within=(0, 0.05)
     )

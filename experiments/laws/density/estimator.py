@@ -46,44 +46,46 @@ class EstimatorConfig:
     spread of a dose is 0.05 to 0.30. Growth falls by up to 40 % from 37 to 30 degC.
     """
 
-    kind: str = setting("kalman", "which estimator")
+    kind: str = setting("kalman", "estimator")
     noise_floor: float = setting(0.005, "sd of a reading = hypot(floor, relative * OD)", "OD", within=(1e-4, 0.1))
     noise_relative: float = setting(0.003, "see noise_floor", within=(0, 0.1))
     noise_memory: float = setting(
-        40.0, "readings over which the noise level is learned; 0: it stays as assumed", "readings", within=(0, 10_000)
+        40.0, "readings over which the noise level is learned; 0: not learned", "readings", within=(0, 10_000)
     )
-    mu_sd: float = setting(0.012, "sd of the first guess of mu, around the model's", "1/min", within=(1e-5, 0.1))
+    mu_sd: float = setting(0.012, "sd of the initial mu, around the model's", "1/min", within=(1e-5, 0.1))
     mu_walk: float = setting(2e-4, "random walk of mu", "1/min per sqrt(min)", within=(0, 0.01))
-    gain_sd: float = setting(0.25, "sd of the first guess of the pump's flow over the calibrated one", within=(0, 1))
-    gain_walk: float = setting(2e-3, "its random walk", "per sqrt(min)", within=(0, 0.1))
+    gain_sd: float = setting(0.25, "sd of the initial gain: true over calibrated flow of the pump", within=(0, 1))
+    gain_walk: float = setting(2e-3, "random walk of the gain", "per sqrt(min)", within=(0, 0.1))
     warmth: float = setting(
-        0.025, "growth per degree, as a share of the model's mu: 0 to 40 % over 7 degrees", "1/degC", within=(0, 0.2)
+        0.025, "relative change of growth per degree: 0 to 40 % over 7 degrees", "1/degC", within=(0, 0.2)
     )
     warmth_sd: float = setting(
-        0.02, "sd of that first guess; 0 with warmth = 0: temperature is not used", "1/degC", within=(0, 0.2)
+        0.02, "sd of that initial value; 0 with warmth = 0: temperature is not used", "1/degC", within=(0, 0.2)
     )
-    pulse_cv: float = setting(0.15, "spread of a dose", within=(0, 1))
-    first_dose: float = setting(0.7, "share of the first dose after a pause that arrives: 0.3 to 1", within=(0.1, 1))
-    first_dose_sd: float = setting(0.25, "its sd", within=(0, 1))
-    pause_min: float = setting(10.0, "rest after which a dose counts as a first one", "min", within=(1, 1440))
+    pulse_cv: float = setting(0.15, "relative spread of a dose", within=(0, 1))
+    first_dose: float = setting(0.7, "fraction delivered by the first dose after a pause: 0.3 to 1", within=(0.1, 1))
+    first_dose_sd: float = setting(0.25, "sd of that fraction", within=(0, 1))
+    pause_min: float = setting(10.0, "length of such a pause", "min", within=(1, 1440))
     growth_cv: float = setting(0.05, "spread of the growth within a minute, relative to mu (assumption)", within=(0, 1))
-    gate_sigma: float = setting(5.0, "a reading further off than this is an outlier ...", "sigma", within=(2, 20))
-    gate_max: int = setting(6, "... unless so many in a row agree; bubbles last up to 5", "readings", within=(1, 20))
+    gate_sigma: float = setting(5.0, "innovation above which a reading is an outlier", "sigma", within=(2, 20))
+    gate_max: int = setting(
+        6, "agreeing outliers in a row that are accepted; bubbles: up to 5", "readings", within=(1, 20)
+    )
     gate_od: float = setting(
         0.025,
-        "a jump is believed after one agreeing reading per so much OD, at least 2, at most gate_max; 0: gate_max",
+        "a jump is accepted after one agreeing reading per this much OD, at least 2, at most gate_max; 0: gate_max",
         "OD",
         within=(0, 1),
         note="the smaller it is, the less harm following it does",
     )
     hurry: float = setting(
         150.0,
-        "walks are faster while surprises agree in sign: variance times 1 + hurry (m - 1.5)^2 where their running mean "
-        "is m > 1.5 of its sd; 0: never",
+        "speed-up of the random walks while innovations agree in sign: variance times 1 + hurry (m - 1.5)^2 if their "
+        "running mean is m > 1.5 of its sd; 0: none",
         within=(0, 10_000),
     )
-    recovery: bool = setting(True, "readings before the schedule begins are used")
-    told: bool = setting(True, "doses are those that were given, not those that were decided")
+    recovery: bool = setting(True, "use readings before the schedule begins")
+    told: bool = setting(True, "use the volume delivered instead of the volume requested")
 
     def __post_init__(self) -> None:
         check(self, "controller.estimator")

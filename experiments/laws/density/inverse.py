@@ -19,11 +19,11 @@ __all__ = ["Inverse", "InverseConfig"]
 class InverseConfig(ControllerConfig):
     """The one-line law and what it believes."""
 
-    kind: str = setting("inverse", "which controller")
+    kind: str = setting("inverse", "controller")
     levels: int = setting(
-        0, "pump rates it chooses from, equally spaced, the nearest one; 0: any rate", within=(0, 1001)
+        0, "number of equally spaced pump rates, of which the nearest is used; 0: any rate", within=(0, 1001)
     )
-    estimator: Any = part(EstimatorConfig, "what the filter believes", estimators.config_at)
+    estimator: Any = part(EstimatorConfig, "settings of the estimator", estimators.config_at)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,9 +24,9 @@ WATCHED = 2.0  # sd of an estimate that count as its error
 class LearnedConfig(ControllerConfig):
     """Everything about a policy is in its file, the estimator's settings too."""
 
-    kind: str = setting("dqn", "which controller")
+    kind: str = setting("dqn", "controller")
     estimator: dict[str, Any] = setting(
-        {}, "of a policy in relative coordinates: what replaces the settings in its file, estimator.noise_memory=0"
+        {}, "policy in relative coordinates: replaces settings of its file, e.g. estimator.noise_memory=0"
     )
 
 

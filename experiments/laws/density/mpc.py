@@ -18,19 +18,19 @@ LOWEST_OD = 1e-3  # a reading below is taken for this: the model cannot grow fro
 class MpcConfig(ControllerConfig):
     """The paper's receding-horizon controller; `gradient` is L-BFGS-B with the exact gradient, as a cross-check."""
 
-    kind: str = setting("mpc", "which controller")
+    kind: str = setting("mpc", "controller")
     horizon: int = setting(
         5,
-        "of 1 min (paper); the first move is applied (paper: control horizon 1 min)",
+        "prediction horizon in periods of 1 min (paper); only the first move is applied (paper: control horizon 1 min)",
         "control periods",
         within=(1, 60),
     )
     penalty: float = setting(
         100.0, "cost of a move outside [0, max_pump_rate] (paper)", above=0.0, note="or the pump's range costs nothing"
     )
-    solver: str = setting("pso", "of the paper: pso", choices=("pso", "gradient"))
-    swarm: SwarmConfig = part(SwarmConfig, "how the swarms search; the paper names the method and no numbers")
-    seed: int = setting(0, "of the swarms", at_least=0)
+    solver: str = setting("pso", "optimiser; pso: the paper's", choices=("pso", "gradient"))
+    swarm: SwarmConfig = part(SwarmConfig, "particle swarm; the paper states no numbers")
+    seed: int = setting(0, "random seed of the swarms", at_least=0)
 
 
 @dataclass(frozen=True, eq=False)

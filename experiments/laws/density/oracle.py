@@ -23,9 +23,9 @@ DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
 class OracleConfig(ControllerConfig):
     """Action grid and discount. 129 levels hold the learned policy's 17, and finer ones gain nothing measurable."""
 
-    kind: str = setting("oracle", "which controller")
-    levels: int = setting(129, "pump rates on [0, max_pump_rate]", within=(2, 1001))
-    gamma: float = setting(0.99, "discount per control period, the agent's", at_least=0.0, below=1.0)
+    kind: str = setting("oracle", "controller")
+    levels: int = setting(129, "number of pump rates on [0, max_pump_rate]", within=(2, 1001))
+    gamma: float = setting(0.99, "discount per control period, as the agent's", at_least=0.0, below=1.0)
 
 
 @cache

@@ -19,8 +19,8 @@ LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
 class ChiBioPIConfig(ControllerConfig):
     """What the device's law is told; its gains are constants of the device's code."""
 
-    kind: str = setting("pi", "which controller")
-    max_pump_rate: float = setting(MAX_PUMP_RATE, "the device's clamp", "mL/s", above=0.0, at_most=0.05)
+    kind: str = setting("pi", "controller")
+    max_pump_rate: float = setting(MAX_PUMP_RATE, "limit, as on the device", "mL/s", above=0.0, at_most=0.05)
 
 
 class ChiBioPI:
@@ -86,12 +86,12 @@ class ChiBioPI:
 class TunedPIConfig(ControllerConfig):
     """The two times of the tuning rule; mu, tau and the largest pump rate come from the model."""
 
-    kind: str = setting("pi_tuned", "which controller")
-    delay_min: float = setting(1.0, "until a decision shows: one control period", "min", within=(0.5, 60))
+    kind: str = setting("pi_tuned", "controller")
+    delay_min: float = setting(1.0, "delay until a decision is visible: one control period", "min", within=(0.5, 60))
     closed_loop_min: float = setting(
-        1.0, "wanted time constant; SIMC's tight setting is the delay", "min", within=(0.5, 60)
+        1.0, "closed-loop time constant; SIMC's tight setting equals the delay", "min", within=(0.5, 60)
     )
-    feed_forward: bool = setting(True, "start the integrator at mu of the model instead of 0")
+    feed_forward: bool = setting(True, "start the integrator at the model's mu instead of 0")
 
 
 class TunedPI:

@@ -25,10 +25,10 @@ class SwarmConfig:
       Evolutionary Computation 25:1, section 3).
     """
 
-    particles: int = setting(40, "per swarm", within=(2, 10_000))
-    iterations: int = setting(120, "per swarm", within=(1, 10_000))
+    particles: int = setting(40, "particles per swarm", within=(2, 10_000))
+    iterations: int = setting(120, "iterations per swarm", within=(1, 10_000))
     inertia: float = setting(0.7298, "weight of a particle's velocity", at_least=0.0, below=1.0)
-    attraction: float = setting(1.49618, "of the pulls to its own and to the swarm's best place")
+    attraction: float = setting(1.49618, "weight of the pull to a particle's own best and to the swarm's best position")
 
     def __post_init__(self) -> None:
         check(self, "controller.swarm")

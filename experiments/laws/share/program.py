@@ -13,7 +13,7 @@ __all__ = ["SINE_LEAD_MIN", "Program"]
 
 SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4
 """A share that changes all the time is announced as a step to the one so far ahead, after that part of this time
-(docs/coculture.md, Laws).
+(docs/coculture.md, Composition controllers).
 """
 
 
