@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 ROOMS = ("conf", "dqn", "envs", "experiments", "hardware")
 ELSEWHERE = {  # not on the page: bases, and what the programs beside the commands take
     "CocultureConfig", "ControllerConfig", "DeviceOptions", "LawConfig", "PreviewConfig", "PumpCalibration",
-    "RelativeConfig", "VialConfig",
+    "RelativeConfig", "Source", "VialConfig",
 }  # fmt: skip
 NUMBER = r"(-?(?:\d[\d.]*(?:e[-+]?\d+)?|inf))"
 

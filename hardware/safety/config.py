@@ -55,7 +55,7 @@ REMEDIES = {
     "thermometer": "check that the vial is seated; heating stays off in this run",
     "device": "see the text",
     "fluorescence": "check LED, spectrometer and the slot's gain",
-    "fluorescence_lost": "composition is not seen: check LED and spectrometer, then look at the device's FP slot",
+    "fluorescence_lost": "what it tells is not seen: check LED and spectrometer, then look at the device's FP slot",
     "command_limit": "nothing if the law asked for too much; else set safety.composition_low and composition_high",
 }
 RESPONSES = {
@@ -184,7 +184,7 @@ class SafetyConfig:
 
     def __post_init__(self) -> None:
         check(self, "safety")
-        low, high = self.composition_low, self.composition_high
+        low, high = self.targets
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
     def response(self, kind: str) -> Response:
@@ -194,6 +194,11 @@ class SafetyConfig:
     def ml_a_minute(self, bench: Bench) -> float:
         """Feed budget of a minute, mL."""
         return 2.5 * (bench.max_rate * bench.period_s) if self.ml_per_minute is None else self.ml_per_minute
+
+    @property
+    def targets(self) -> tuple[float, float]:
+        """Lowest and highest target of the thermostat that a signal may set, degC."""
+        return self.composition_low, self.composition_high
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
         """Ages of a newest sample that is stale and that is lost, s.

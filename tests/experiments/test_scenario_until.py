@@ -11,6 +11,7 @@ import pytest
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.coculture.program import composed
 from experiments.comparison.config import BenchmarkConfig
 from experiments.laws.density.baselines import Hold, HoldConfig
 from experiments.loop.loop import ClosedLoop
@@ -126,7 +127,7 @@ def test_conditions_do_not_go_with_shares_and_need_one_for_each_step() -> None:
         Scenario(until=("settled",), ratios=(0.3,))
     with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed none or one for each of the 1 phases"):
         Scenario(until=("settled", None))
-    assert Scenario(until=(None,), ratios=(0.3,)).composed
+    assert composed(Scenario(until=(None,), ratios=(0.3,)))
 
 
 def _run(folder: Path, schedule: Scenario = GROWS, **each: object) -> Rehearsal:

@@ -14,18 +14,20 @@ from unittest.mock import patch
 import numpy as np
 
 from conf.schema import check, setting
+from envs.coculture.second import of_plant
 from envs.coculture.task import logit
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import main as benchmark
-from experiments.comparison import trials
+from experiments.coculture import comparison
+from experiments.coculture.base import ShareEstimate
+from experiments.coculture.comparison import ShareCell
+from experiments.coculture.recall import Recall
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.statistics import Spread
 from experiments.comparison.trials import Cell, DensityTrial, run_cell, run_trial, windows
 from experiments.laws import registry
 from experiments.laws.base import Array, Controller
-from experiments.laws.share.base import ShareEstimate
-from experiments.laws.share.recall import Recall
 from experiments.reporting.tables import number
 from tests.entry import command
 from tests.studies.results import leave
@@ -107,21 +109,25 @@ def told() -> Iterator[None]:
     def truth(_: Any) -> ShareEstimate:
         plant = vials[-1]
         rate, zero = 60.0 * plant.culture.rates(plant.age_min)[:, 1], np.zeros(plant.n)
-        first, second = plant.draws["mu"] / plant.config.growth.mu, plant.draws["second_mu"] / plant.config.second.mu
+        first, second = (
+            plant.draws["mu"] / plant.config.growth.mu,
+            plant.draws["second_mu"] / of_plant(plant.config).second.mu,
+        )
         state = logit(plant.culture.share), zero, plant.thermal.temperature, rate
         return ShareEstimate(*state, first - 1.0, second - 1.0, -plant.thermal.offset)
 
-    met = patch.object(trials, "calibrate", lambda _, plant, seed: vials.append(plant))
+    met = patch.object(comparison, "calibrate", lambda _, plant, seed: vials.append(plant))
     with met, patch.object(Recall, "estimate", truth):
         yield
 
 
 def composed(known: BenchmarkConfig, plant: str) -> list[float]:
     """Mean |share - setpoint| of `midpoint` on its estimate, on the truth, and of the optimum on the truth."""
-    found: list[Any] = [run_cell(known, Cell("midpoint", plant, "ratio_steps", "share", "inverse", True), None)]
+    cell = ShareCell("midpoint", plant, "ratio_steps", density="inverse", announced=True)
+    found: list[Any] = [run_cell(known, cell, None)]
     with told():
         for law in ("midpoint", "optimum"):
-            found.append(run_cell(known, Cell(law, plant, "ratio_steps", "share", "inverse", True, True), None))
+            found.append(run_cell(known, replace(cell, controller=law, calibrated=True), None))
     return [float(np.nanmean(np.abs(trial.share - trial.setpoint))) for trial in found]
 
 

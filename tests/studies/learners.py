@@ -28,12 +28,12 @@ from envs.preview import half_way, program_of
 from envs.task import step_factors
 from experiments.cli import files
 from experiments.cli.stop import Workers
+from experiments.coculture.base import SHARE, Array, ShareEstimate, Wanted
+from experiments.coculture.task import Coculture
 from experiments.laws import registry
-from experiments.laws.share.base import Array, ShareEstimate, Wanted
 from experiments.reporting.tables import number
 from experiments.train import main as train
 from experiments.training import build, tasks
-from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Act, Evaluation
 from experiments.training.preview import Preview
 from experiments.training.session import Session
@@ -233,7 +233,7 @@ def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
 
     Its target is not one of the policies' but any, and those with a period of a minute act within a decision, too.
     """
-    law = registry.build(registry.config(kind, registry.SHARE), registry.SHARE)
+    law = registry.build(registry.config(kind, SHARE), SHARE)
     n, each_min = len(start), round(config.control_min)
     law.reset(n)
     state, goal, total = start[:, :3], start[:, 3:], np.zeros(n)
