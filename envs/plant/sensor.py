@@ -26,6 +26,12 @@ class SensorConfig:
     )
     noise_relative: float = setting(0.0, "see noise_floor", within=(0, 0.1))
     noise_factor_sd: float = setting(0.0, "sd of the logarithm of a reactor's noise factor (median 1)", within=(0, 1))
+    noise_swing_sd: float = setting(
+        0.0, "sd of the logarithm of the slow factor (median 1) of a reactor's noise", within=(0, 1)
+    )
+    noise_swing_min: float = setting(
+        180.0, "correlation time of that factor, with a reading each minute", "min", within=(1, 10_000)
+    )
     lag1: float = setting(0.0, "correlation of the noise of successive readings", within=(0, 0.95))
     gain_cv: float = setting(0.0, "spread between reactors of the slope k in y = k (x + c x^2)", within=(0, 0.3))
     curvature: float = setting(0.0, "limit of c, which is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
@@ -88,16 +94,17 @@ class OdSensor:
             "sensor_offset": uniform(rngs, -config.blank_error, config.blank_error),
             "sensor_noise_factor": np.exp(spread(rngs, 1.0, config.noise_factor_sd) - 1.0),
             "sensor_blank_counts": spread(rngs, config.blank_counts, config.blank_cv),
+            "sensor_noise_swing": spread(rngs, 1.0, config.noise_swing_sd) - 1.0,
         }
         self.frozen: Mask = np.zeros(n, dtype=bool)
         self.extra_offset: Array = np.zeros(n)
-        self._tape = Tape(noise_rngs, normals=1, uniforms=9)
+        self._tape = Tape(noise_rngs, normals=1 + (config.noise_swing_sd > 0.0), uniforms=9)
         self.reset()
 
     def reset(self) -> None:
         """Forget past readings: no bubble, no frozen reading, no correlated noise."""
         n = self.frozen.size
-        self._noise = np.zeros(n)
+        self._noise, self._swing = np.zeros(n), self.draws["sensor_noise_swing"]
         self._bubble, self._bubble_left, self._freeze_left = np.zeros(n), np.zeros(n), np.zeros(n)
         self._last = np.full(n, np.nan)
 
@@ -117,10 +124,14 @@ class OdSensor:
     def read(self, od: Array, wall: Array, minutes: float) -> Array:
         """Take one averaged reading with all errors; arguments as `apparent`, OD, shape (N,)."""
         c = self.config
-        (z,), u = self._tape.next()
+        (z, *swing), u = self._tape.next()
         clean = self.apparent(od, wall, minutes)
         self._noise = c.lag1 * self._noise + np.sqrt(1.0 - c.lag1**2) * z
         sd = np.hypot(c.noise_floor, c.noise_relative * clean) * self.draws["sensor_noise_factor"]
+        for z in swing:
+            kept = np.exp(-1.0 / c.noise_swing_min)
+            self._swing = kept * self._swing + np.sqrt(1.0 - kept**2) * c.noise_swing_sd * z
+            sd = sd * np.exp(self._swing)
         value = clean + sd * self._noise + self._misreading(u)
         if c.quantised:
             blank = np.round(self.draws["sensor_blank_counts"])

@@ -150,6 +150,9 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         policy = policies.load(path)
         training = Training.of(policy)
         fastest = 0.0 if training.relative else float(policy.actions.max())
+    if policy.observation not in (policies.ABSOLUTE, policies.RELATIVE):
+        seen = ", ".join(policy.observation)
+        raise frame.UserError(f"policy {path} observes {seen}; give a policy of env=sim or env=relative")
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
         raise frame.UserError(
             f"policy {path} was trained for a control period of {training.control_min} min, "

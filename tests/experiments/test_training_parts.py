@@ -227,7 +227,7 @@ def test_the_summary_names_the_seed_of_the_policy_that_flies_and_has_of_each_wha
 
 
 TASKS = (
-    ("sim", "tuned"), ("sim", "paper"), ("relative", "relative"),
+    ("sim", "tuned"), ("sim", "paper"), ("relative", "relative"), ("preview", "preview"),
     *(pytest.param(name, name, marks=pytest.mark.slow) for name in ("coculture", "coculture_preview")),
 )  # fmt: skip
 
