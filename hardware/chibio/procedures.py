@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hardware.chibio.connection import Connection
+from hardware.chibio.messages import ExperimentRuns
 from hardware.chibio.protocol import PERIOD_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
@@ -25,7 +26,7 @@ def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, do
     """
     state = connection.read()
     if state.running:
-        raise DeviceStateError(f"{connection.name}: an experiment is running; stop it before pumps are weighed")
+        raise ExperimentRuns(reactor=connection.name)
     try:
         connection.pumps_off()
         connection.target(pump, duty)

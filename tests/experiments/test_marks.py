@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-import re
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -182,7 +181,6 @@ def test_a_bottle_that_was_filled_is_dosed_from_at_once_and_counted_from_then_al
     reasons = ""
     while "no_dilution" not in reasons:
         reasons = next(steps).reasons[0] or ""
-    assert re.search(r"of \d+\.\d mL some or all was air", reasons)
     inject(made.device, "media_left_ml", "M0", 700.0)
     add_mark(tmp_path, Mark(1.0, "M0", "bottle", bottle_ml=700.0))
     marks.take(made.loop)

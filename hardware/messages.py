@@ -1,0 +1,68 @@
+"""What every kind of reactor may tell of itself or its link: faults, and notes on doses."""
+
+import re
+from typing import ClassVar
+
+from conf.messages import Message
+from hardware.errors import DeviceStateError
+
+
+class Fault(Message):
+    """Something wrong with one reactor: which kind, what was seen, what helps.
+
+    Attributes: response, what the interlock does about it, a word of `hardware.safety.config.WORDS`; kind, by which
+      settings and records name it: the class that declares the response, with underscores and without "Fault".
+    """
+
+    kind: ClassVar[str] = ""
+    response: ClassVar[str] = ""
+
+    def __init_subclass__(cls, response: str = "", **words: str) -> None:
+        super().__init_subclass__(**words)
+        if response:
+            cls.response = response
+            cls.kind = re.sub(r"\B([A-Z])", r"_\1", cls.__name__.removesuffix("Fault")).lower()
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {super().__str__()}"
+
+
+# fmt: off
+
+class LinkFault(Fault, response="hold"):
+    """No answer, or none that is readable."""
+class SelectionFault(Fault, response="hold"):
+    """Another client keeps choosing reactors, so the device shows another one than was asked for."""
+class IdentityFault(Fault, response="stop"):
+    """Another unit answers than the run began with."""
+class AbsentFault(Fault, response="hold"):
+    """No reactor is at this position; nothing is sent to it."""
+class RestartedFault(Fault, response="hold"):
+    """The device lost its memory."""
+class StoppedFault(Fault, response="pumps_off"):
+    """The experiment was ended."""
+class StalledFault(Fault, response="hold"):
+    """The device answers and takes no samples."""
+class ModeFault(Fault, response="hold"):
+    """Something else acts on the pumps."""
+class BlankFault(Fault, response="hold"):
+    """The zero of the OD was changed."""
+class PumpFault(Fault, response="pumps_off"):
+    """A pump runs that should not, or was not verified off."""
+class OverflowPumpFault(Fault, response="hold"):
+    """An overflow pump is configured and cannot be verified on."""
+class UndosedFault(Fault, response="report"): ...
+class NoDose(Message, says="no dose: {why}"):
+    """Nothing was begun for this sample; the culture grows undiluted."""
+class NoNewSample(Message, says="no new sample"):
+    """The sample was answered already, or none came yet."""
+class DoseUnderWay(Message, says="the previous dose has not ended"):
+    """Its pumps are not yet verified off; if that stays, see the fault of kind pump."""
+class OpenDose(Message, says="an earlier life of the program left a dose of {ml:.2f} mL open",
+    remedy="look at the level and at the bottle"):
+    """The program died in a dose; the next note says what it gave, if not what was planned."""
+class NotLeftOff(DeviceStateError, says="{why}; {failed}"):
+    """A start failed or was stopped, and left pumps that were not verified off."""
+class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
+    remedy="pull the plug of the pump boards now"):
+    """A pump may run: at the end of a run, after all tries."""
