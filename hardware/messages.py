@@ -29,28 +29,17 @@ class Fault(Message):
 
 # fmt: off
 
-class LinkFault(Fault, response="hold"):
-    """No answer, or none that is readable."""
-class SelectionFault(Fault, response="hold"):
-    """Another client keeps choosing reactors, so the device shows another one than was asked for."""
-class IdentityFault(Fault, response="stop"):
-    """Another unit answers than the run began with."""
-class AbsentFault(Fault, response="hold"):
-    """No reactor is at this position; nothing is sent to it."""
-class RestartedFault(Fault, response="hold"):
-    """The device lost its memory."""
-class StoppedFault(Fault, response="pumps_off"):
-    """The experiment was ended."""
-class StalledFault(Fault, response="hold"):
-    """The device answers and takes no samples."""
-class ModeFault(Fault, response="hold"):
-    """Something else acts on the pumps."""
-class BlankFault(Fault, response="hold"):
-    """The zero of the OD was changed."""
-class PumpFault(Fault, response="pumps_off"):
-    """A pump runs that should not, or was not verified off."""
-class OverflowPumpFault(Fault, response="hold"):
-    """An overflow pump is configured and cannot be verified on."""
+class LinkFault(Fault, response="hold"): ...
+class SelectionFault(Fault, response="hold"): ...
+class IdentityFault(Fault, response="stop"): ...
+class AbsentFault(Fault, response="hold"): ...
+class RestartedFault(Fault, response="hold"): ...
+class StoppedFault(Fault, response="pumps_off"): ...
+class StalledFault(Fault, response="hold"): ...
+class ModeFault(Fault, response="hold"): ...
+class BlankFault(Fault, response="hold"): ...
+class PumpFault(Fault, response="pumps_off"): ...
+class OverflowPumpFault(Fault, response="hold"): ...
 class UndosedFault(Fault, response="report"): ...
 class NoDose(Message, says="no dose: {why}"):
     """Nothing was begun for this sample; the culture grows undiluted."""
@@ -61,8 +50,6 @@ class DoseUnderWay(Message, says="the previous dose has not ended"):
 class OpenDose(Message, says="an earlier life of the program left a dose of {ml:.2f} mL open",
     remedy="look at the level and at the bottle"):
     """The program died in a dose; the next note says what it gave, if not what was planned."""
-class NotLeftOff(DeviceStateError, says="{why}; {failed}"):
-    """A start failed or was stopped, and left pumps that were not verified off."""
+class NotLeftOff(DeviceStateError, says="{why}; {failed}"): ...
 class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
-    remedy="pull the plug of the pump boards now"):
-    """A pump may run: at the end of a run, after all tries."""
+    remedy="pull the plug of the pump boards now"): ...

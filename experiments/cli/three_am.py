@@ -35,14 +35,15 @@ def _sort(kind: type[Message]) -> str:
 def _table(what: str, room: str) -> str:
     alarms = what == "alarms"
     heads = ("the screen says", "it means", *(["the program did"] if alarms else []), "do now")
-    return markdown(heads, [list(_cells(one)) for one in declared(what, room)])
+    worded = [one for one in declared(what, room) if alarms or re.search(r"\w", _shown(one.says))]
+    return markdown(heads, [list(_cells(one)) for one in worded])
 
 
 def _cells(kind: type[Message]) -> Iterator[str]:
     """Yield the sentence of a message, its meaning, its response if it is a fault, its remedy; … is what varies."""
     name = f"{kind.kind}: " if issubclass(kind, Fault) else ""
     yield f"`{name}{_shown(kind.says)}`"
-    own = (one.__doc__ for one in kind.__mro__ if one is kind or "response" in vars(one))
+    own = (one.__doc__ for one in kind.__mro__ if one is kind or vars(one).get("response"))
     yield next(filter(None, own), "").removesuffix(".")
     if issubclass(kind, Fault):
         yield f"`{kind.response}`"

@@ -20,25 +20,20 @@ class ExperimentGone(any_kind.RestartedFault,
 class EndedByUs(any_kind.StoppedFault, says="this program ended the experiment: {why}", remedy="it is started again"):
     """Pumps did not stop, or no sample came; started again every minute."""
 class EndedBySomebody(any_kind.StoppedFault, says="the experiment was stopped by someone",
-    remedy="start it in the device's web page, close the page"):
-    """It stays ended until somebody starts it."""
+    remedy="start it in the device's web page, close the page"): ...
 class NotTakenOver(any_kind.StoppedFault, says="not taken over: {error}",
-    remedy="the others go on and this one is tried again"):
-    """A resumed run cannot have one reactor."""
+    remedy="the others go on and this one is tried again"): ...
 class BlankChanged(any_kind.BlankFault, says="the blank was changed from {before:.1f} to {now:.1f}",
-    remedy="set it back (raw {before:.1f}, OD 0) or start a new run"):
-    """Somebody calibrated the OD."""
+    remedy="set it back (raw {before:.1f}, OD 0) or start a new run"): ...
 class PumpStaysOn(any_kind.PumpFault, says="{why}", remedy="switch the pump board off by hand"):
     """A pump was told to stop and not verified off; after four tries the device's experiment is ended."""
 class StrayPump(any_kind.PumpFault, says="pumps on: {pumps}, and no dose has them",
     remedy="close the device's web page everywhere; look for a proxy that repeats requests"):
     """Another program switched a pump on, or a command was late or repeated on the way; booked."""
 class ForeignMode(any_kind.ModeFault, says="{mode}: not as this program left it",
-    remedy="set it back in the device's web page, close the page"):
-    """The device regulates by itself."""
+    remedy="set it back in the device's web page, close the page"): ...
 class NoSamples(any_kind.StalledFault, says="no new sample for {age_s:.0f} s, cycles {cycles}",
-    remedy="after {lost_s:.0f} s its experiment is restarted; look at the device's terminal"):
-    """The device answers and takes no samples."""
+    remedy="after {lost_s:.0f} s its experiment is restarted; look at the device's terminal"): ...
 class NoNumber(any_kind.StalledFault, says="no new sample for {age_s:.0f} s, cycles {cycles}: {items} holds no number",
     remedy="only a restart of the device's software helps; then resume"):
     """Somebody set a pump to nan; the app cannot write its records any more."""
@@ -57,38 +52,30 @@ class TooSlow(DeviceStateError, says="the device answers too slowly ({past_s:.0f
     remedy="close web pages; use a faster link"): ...
 class NotAsSet(DeviceStateError, says="targets {targets}, pumps on: {pumps}: not as set",
     remedy="close the device's web page everywhere"): ...
-class KeptForNextDose(Message, says="{ml:.3f} mL is less than the pump can deliver: kept for the next dose"):
-    """Below what the motor can do; nothing to do."""
-class DoseCut(Message, says="the dose was cut by {ml:.3f} mL to the feed limit"):
-    """More was asked than one dose may be; if it is not rare, weigh the pump."""
+class KeptForNextDose(Message, says="{ml:.3f} mL is less than the pump can deliver: kept for the next dose"): ...
+class DoseCut(Message, says="the dose was cut by {ml:.3f} mL to the feed limit"): ...
 class CommandLost(Message, says="the command to {pump} was lost or refused, what it did is looked for: {error}"): ...
 class SlowLink(Message, says="the link is slow: the feed pump's command was answered after {took_s:.1f} s",
-    remedy="close web pages; use a faster link"):
-    """The dose is counted from the answer."""
+    remedy="close web pages; use a faster link"): ...
 class DoseRepeated(Message,
     says="a dose of {ml:.2f} mL was repeated up to {times} times by the device, {low_ml:.2f} to {most_ml:.2f} mL",
-    remedy="booked at their times; look at link and level"):
-    """The device repeats a dose every 63 s until it hears the off command."""
+    remedy="booked at their times; look at link and level"): ...
 class DoseGave(Message, says="a dose of {ml:.2f} mL gave {low_ml:.2f} to {most_ml:.2f} mL, booked as the latter"):
     """Cut short, or not known exactly; alarms go by the least."""
 class DoseGaveNothing(Message, says="a dose of {ml:.2f} mL gave no medium"): ...
 class DosePerhapsTwice(Message,
-    says="a dose gave {ml:.2f} to {twice_ml:.2f} mL, booked as the former: a lost command may have come late"):
-    """For an hour after a lost command each dose may have been given twice."""
+    says="a dose gave {ml:.2f} to {twice_ml:.2f} mL, booked as the former: a lost command may have come late"): ...
 class GivenWithoutDose(Message,
     says="{pump} gave {low_ml:.2f} to {most_ml:.2f} mL without a dose, booked as the latter: {cause}",
-    remedy="close the device's web page everywhere; look at the link"):
-    """A pump was on without a dose; switched off, booked, and the vial drained."""
+    remedy="close the device's web page everywhere; look at the link"): ...
 class ChangedInDose(Message, says="{pump} in a dose: {cause}",
-    remedy="close the device's web page everywhere; look at the link"):
-    """The next note says what the dose gave."""
+    remedy="close the device's web page everywhere; look at the link"): ...
 class TargetChanged(Message, says="its target was changed from {before:.4g} to {now:.4g}"): ...
 class RanAgain(Message,
     says="it ran again, as a command was repeated or late on the way, or another program gave one"): ...
 class AgentSwitchedOff(Message, says="the board agent switched off in a dose: {pumps}", remedy="look at the link"): ...
 class AgentSaysNothing(Message, says="the board agent does not say what it switched off: {error}",
-    remedy="check the cable; update the board agent"):
-    """The link failed, or the agent is of another version; what the pumps may have given is booked."""
+    remedy="check the cable; update the board agent"): ...
 class RestartedInDose(Message, says="the device was restarted in a dose, which ended it",
     remedy="look at the power supply"):
     """A restart switches all pumps off, nobody knows when; the most is booked."""
@@ -97,18 +84,15 @@ class MeasuresTooLong(Message, says="the device has measured for {seconds:.0f} s
 class OldCycle(Message, says="an experiment was stopped, its last cycle may still end: waits {seconds:.0f} s"): ...
 class StoppedMeanwhile(Message, says="its experiment was stopped meanwhile and is started again"): ...
 class StartsInTurn(Message, says="its experiment starts in {seconds:.0f} s, one reactor after the other"): ...
-class RestartedAfter(Message, says="restarted after: {kind}"):
-    """The experiment was started again, with blank and targets."""
+class RestartedAfter(Message, says="restarted after: {kind}"): ...
 class RestartedAgain(Message, says="the restart before brought no sample, attempt {attempt} follows",
     remedy="look at the device's terminal: a thermometer or the spectrometer may be dead"): ...
 class NotRestarted(Message, says="the experiment could not be restarted after {kind}, tried again: {error}"): ...
 class PutRight(Message, says="{item} was {found} and was {done}", remedy="close the device's web page everywhere"):
     """A restart or a web page changed it. A fluorescence slot's cycle has no reading."""
-class NotPutRight(Message, says="{item} was {found} and could not be {done}: {error}"):
-    """Tried again with the next sample."""
+class NotPutRight(Message, says="{item} was {found} and could not be {done}: {error}"): ...
 class TemperatureNotSet(Message,
-    says="thermostat target {target} degC not set, tried again with the next sample: {error}"):
-    """Look at the link if it stays."""
+    says="thermostat target {target} degC not set, tried again with the next sample: {error}"): ...
 class DumpWillFail(Message, says="{items} hold no number, and measuring will end at the device's next dump",
     remedy="restart the device's software within ten minutes; the run goes on then"):
     """The device has measured or heated with a nan; every tenth cycle it writes that to its disk, and cannot."""
@@ -117,39 +101,30 @@ class SampleLate(Message, says="a sample came {late_s:.0f} s late, or the board'
     """One cycle took so long, or the clock was set; no dose for that sample."""
 class SampleBeforeLate(Message,
     says="the sample before came {late_s:.0f} s late, or the board's clock was set forward by that",
-    remedy="nothing if it is once; else switch clock corrections off on the board"):
-    """The run goes on by this computer's clock."""
+    remedy="nothing if it is once; else switch clock corrections off on the board"): ...
 class RegulationFoundOn(Message,
     says="the on-board OD regulation was found on and switched off: this run controls"): ...
-class RegulationEnded(Message, says="on-board regulation switched off: the reactor is given up"):
-    """Stopped after it had been handed over; see why it was stopped."""
+class RegulationEnded(Message, says="on-board regulation switched off: the reactor is given up"): ...
 class StaysHandedOver(Message,
-    says="handed over to the on-board regulation at OD {setpoint:g} earlier in this run: {done}"):
-    """A resumed run or restarted device leaves it so, or restores it."""
+    says="handed over to the on-board regulation at OD {setpoint:g} earlier in this run: {done}"): ...
 class SlotAmiss(Message, says="the fluorescence slot {slot} is {found} after it was switched on",
-    remedy="update the device's software or the board agent"):
-    """Tried again; no reading of the light until then."""
+    remedy="update the device's software or the board agent"): ...
 class NotReady(DeviceStateError, says="{reactor}: {trouble}", remedy="run the preflight"): ...
 class ModeOn(DeviceStateError, says="{reactor}: {modes} is on",
     remedy="switch it off in the device's web page, close the page"): ...
 class SettingsNotTaken(DeviceStateError,
     says="{reactor} took other settings: blank {blank:.1f}, not {asked:.1f}, thermostat {target} degC, not {asked_c}",
-    remedy="run the preflight"):
-    """The run does not start, or the recovery ends."""
+    remedy="run the preflight"): ...
 class DoesNotStart(DeviceStateError, says="{reactor}: the experiment does not start",
-    remedy="look at the device's terminal; restart the device"):
-    """Three tries; the run does not start, or the recovery ends."""
+    remedy="look at the device's terminal; restart the device"): ...
 class DoesNotEnd(DeviceStateError, says="{reactor}: the experiment does not end",
-    remedy="stop it in the device's web page"):
-    """After a blank: the experiment goes on."""
+    remedy="stop it in the device's web page"): ...
 class HandOverFailed(DeviceStateError, says="{reactor}: {found} after it was switched on at {setpoint:g}",
-    remedy="close web pages; if it stays, end the run"):
-    """The hand-over did not take; tried again."""
+    remedy="close web pages; if it stays, end the run"): ...
 class StillOn(DeviceStateError, says="{reactor}: {pumps} still on after the off command{refused}"):
     """Tried again, then the experiment is ended; the waste pump runs beside a feed pump that may run."""
 class CannotBeRead(DeviceStateError,
-    says="{reactor} cannot be read: the device shows {shown}; another client keeps selecting reactors"):
-    """Each read showed another reactor: no dose."""
+    says="{reactor} cannot be read: the device shows {shown}; another client keeps selecting reactors"): ...
 class OtherIdentity(IdentityError, says="{reactor} answers with identity {found}, pinned is {pinned}"):
     """Reactors were exchanged, or the device is an emulated one, new each time: such a run cannot be resumed."""
 class Absent(DeviceStateError, says="{reactor} is absent (present: {present})"):
