@@ -26,6 +26,10 @@ class Fault(Message):
     def __str__(self) -> str:
         return f"{self.kind}: {super().__str__()}"
 
+    def line(self, done: str) -> str:
+        """Say it with what was done about it."""
+        return f"{self.kind}: " + "; ".join(filter(None, (self.sentence, done, self.remedy)))
+
 
 # fmt: off
 
@@ -53,3 +57,13 @@ class OpenDose(Message, says="an earlier life of the program left a dose of {ml:
 class NotLeftOff(DeviceStateError, says="{why}; {failed}"): ...
 class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
     remedy="pull the plug of the pump boards now"): ...
+class PreflightFailed(DeviceStateError, says="preflight: {count} of {of} checks failed, the first: {first}"): ...
+class PumpsNotLookedAt(Message, says="stopped before the pumps were looked at: pumps not verified off",
+    remedy="look at the pumps, resume the run"):
+    """An earlier life of the run may have left a pump on."""
+class ClockMoved(Message, says="this computer's clock moved by {by_min:.1f} min since the run's last row: "
+    "the run goes on at minute {minute:.1f}, without that step", remedy="set its clock right, look at its battery"):
+    """The clock was set while no program ran; the run counts by the device's cycles and a clock that nobody sets."""
+class ClockDoubtful(Message, says="how long no program ran is known by this computer's clock alone, which may be wrong",
+    remedy="compare the minute in the next line with a watch"):
+    """Computer and device were both started anew."""

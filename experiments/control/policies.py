@@ -18,6 +18,7 @@ from experiments.certification import certificate
 from experiments.certification.certificate import Opinion
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
+from experiments.control import messages
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from hardware.family import Check
@@ -122,7 +123,7 @@ def find_policy(name: str) -> Path:
     Raises: UserError saying what to give instead.
     """
     if not name.strip():
-        raise frame.UserError("policy is empty: give policy=latest, shipped, a run folder or a policy.npz")
+        raise messages.NoPolicyNamed()
     if name == "shipped":
         return SHIPPED
     if name == "latest":
@@ -143,7 +144,7 @@ def _readable(path: Path) -> Iterator[None]:
         raise frame.UserError(str(error)) from None
     except Exception as error:  # whatever a damaged file makes NumPy say
         why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
+        raise messages.PolicyDamaged(path=path, why=why) from None
 
 
 def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
@@ -158,15 +159,9 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         training = Training.of(policy)
         fastest = 0.0 if training.relative else float(policy.actions.max())
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
-        raise frame.UserError(
-            f"policy {path} was trained for a control period of {training.control_min} min, "
-            f"the backend has {control_min} min; train with env.control_min={control_min}"
-        )
+        raise messages.OtherPeriod(path=path, own_min=training.control_min, asked_min=control_min)
     if not fastest <= max_rate + 1e-12:
-        raise frame.UserError(
-            f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
-            "train with a smaller env.max_pump_rate or raise bench.max_rate"
-        )
+        raise messages.PumpsTooMuch(path=path, own=fastest, most=max_rate)
     log.info("policy %s: %s", path, training)
     return policy
 
@@ -179,9 +174,9 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
     """
     found = _judged(policy, file, wanted)
     if found.refused and not resumed and wanted.refuses:
-        raise frame.UserError(f"policy refused: {'; '.join(found.refused + found.short)}; {FORCE}")
+        raise messages.PolicyRefused(why="; ".join(found.refused + found.short), help=FORCE)
     for reason in found.refused + found.short:
-        log.warning("policy: %s", reason)
+        log.warning(messages.PolicyDoubtful(why=reason))
 
 
 def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:

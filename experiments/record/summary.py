@@ -11,10 +11,12 @@ from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
 from experiments.loop.loop import ClosedLoop, Step
+from experiments.loop.messages import FilterAlarm
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
 from experiments.loop.share import program_of
-from experiments.loop.signals import AIM, FILTER_ALARM
+from experiments.loop.signals import AIM
+from experiments.record import messages
 from experiments.record.record import Recordings
 from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
@@ -86,10 +88,10 @@ class ChangeLog:
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
             named = kinds_of(reason)
-            kinds = " ".join(k for k in named if k != FILTER_ALARM) if named else reason
+            kinds = " ".join(k for k in named if k != FilterAlarm.kind) if named else reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
-                said = step.reasons[n] or "interlock: all well again"
+                said = step.reasons[n] or str(messages.WellAgain())
                 log.warning("%s: %s", name, said)
                 self._tell("alarm", said, name)
         for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
@@ -124,9 +126,9 @@ class ChangeLog:
         supervised = bool(step.explanation.get("supervised", np.zeros(len(self._names)))[n])
         if supervised != self._supervised[n]:
             self._supervised[n] = supervised
-            who = "the supervisor's law acts, the estimate is in doubt," if supervised else "the policy acts again"
-            log.info("%s: %s from minute %.0f", self._names[n], who, step.minute[n])
-            self._tell("hand_over", f"{who} from minute {step.minute[n]:.0f}", self._names[n])
+            acts = (messages.SupervisorActs if supervised else messages.PolicyActs)(minute=step.minute[n])
+            log.info(acts.about(self._names[n]))
+            self._tell("hand_over", str(acts), self._names[n])
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
@@ -177,7 +179,7 @@ def summarise(
         "windows": _windows(table, scenarios, progress or Progress(scenarios)),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
-        "repairs": list(table.repairs),
+        "repairs": [str(repair) for repair in table.repairs],
         "marks": [asdict(mark) for mark in table.marks],
     }
 

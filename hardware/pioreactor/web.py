@@ -106,7 +106,7 @@ class Web:
         except LinkError as error:
             nobody = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
             said_so = messages.NobodyReached if nobody else messages.NoReply  # without the remedy of another family
-            raise said_so(error=error.sentence.partition("; ")[0]) from error
+            raise said_so(error=error.sentence) from error
         try:
             answer = json.loads(said or b"null")
         except (ValueError, RecursionError):

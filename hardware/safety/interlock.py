@@ -180,7 +180,7 @@ class Interlock:
         response = np.maximum(response, self._latched.astype(np.int64))
         lines: list[str | None] = []
         for faults, code in zip(found, response, strict=True):
-            texts = [f"{f.kind}: {f.sentence}; {DONE[self._response(f)]}; {f.remedy}".rstrip("; ") for f in faults]
+            texts = [fault.line(DONE[self._response(fault)]) for fault in faults]
             if not texts and code >= Response.REGULATE:
                 texts = [f"{DONE[Response(code)]} earlier in this run"]
             lines.append(" | ".join(texts) or None)

@@ -58,7 +58,7 @@ def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: py
     [
         (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
         (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
-        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat: allowed one"),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat; allowed one"),
     ],
 )
 def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
 
 from conf.messages import Message
 from hardware.clock import VirtualClock
@@ -85,3 +86,8 @@ def noted(rows: Sequence[dict[str, Any]], *kinds: type[Message]) -> list[dict[st
 def why(note: Message) -> type[Message]:
     """Name what a note tells: of one that no dose was begun, the reason."""
     return type(note.fields.get("why", note))
+
+
+def logged(caplog: pytest.LogCaptureFixture, *kinds: type[Message]) -> list[dict[str, Any]]:
+    """The values of these messages on the screen."""
+    return [record.msg.fields for record in caplog.records if isinstance(record.msg, kinds)]

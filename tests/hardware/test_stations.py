@@ -35,6 +35,7 @@ from hardware.simulated import FAMILY, SimulatedConfig, SimulatedReactors
 from hardware.stations import Newest, Stations
 from hardware.storage.doses import Given
 from hardware.storage.journal import Journal
+from hardware.storage.messages import JournalMissing
 
 NAN = math.nan
 
@@ -290,7 +291,7 @@ def test_a_fast_device_s_run_goes_on_by_its_time(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_resumed_run_without_its_journal_is_not_a_new_one(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="missing or empty; put it back, or start a new run"):
+    with pytest.raises(JournalMissing):
         opening(tmp_path, ChiBioConfig()).earlier()
     assert opening(tmp_path, ChiBioConfig(), resumed=False).earlier() == []
 
