@@ -120,7 +120,7 @@ def test_a_pump_that_a_lock_keeps_off_is_told_with_its_command_and_tried_again(l
         lab.sample()
         assert lab.dose(0.5) == 0.5
         lab.wait(8.0)
-        assert [fault.kind for fault in [lab.fault] if fault and "pwm_locks 13" in fault.detail] == told
+        assert [fault.kind for fault in [lab.fault] if fault and fault.fields["why"].fields["pin"] == MEDIA_PIN] == told
         lab.world.locks -= {MEDIA_PIN} if told else set()
 
 
