@@ -69,14 +69,14 @@ class ChangeLog:
         """Log what is new in this step."""
         for n, name in enumerate(self._names):
             if step.ended is not None and step.ended[n]:
-                log.info("%s: %s at OD %.3f", name, self._ended(step, n), step.od[n])
+                log.info(self._ended(step, n))
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._window(step, n)
                 self._phase[n] = int(step.phase[n])
                 share = step.columns.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
                 what += f", share {share:g}" if np.isfinite(share) else ""
-                log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
+                log.info(messages.PhaseBegins(reactor=name, what=what, minute=step.minute[n], od=step.od[n]))
             if step.rows[n]:
                 self._who_decides(step, n)
                 if step.done[n]:
@@ -91,11 +91,11 @@ class ChangeLog:
             kinds = " ".join(k for k in named if k != FilterAlarm.kind) if named else reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
-                said = step.reasons[n] or str(messages.WellAgain())
+                said = step.reasons[n] or messages.WellAgain()
                 log.warning("%s: %s", name, said)
-                self._tell("alarm", said, name)
+                self._tell("alarm", str(said), name)
         for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
-            self._tell("hand_over", "the device regulates by itself from now on", self._names[n])
+            self._tell("hand_over", str(messages.LeftToDevice()), self._names[n])
         self._handed_over = self._reactors.handed_over.copy()
         self.notes(step.now_s, step.notes)
 
@@ -106,19 +106,20 @@ class ChangeLog:
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))
             if now_s >= told_s + AGAIN_S or largest >= 2.0 * before > 0.0:
                 self._noted[kind] = now_s, largest
-                log.info("%s (noted here once an hour, every time in the journal)", note)
+                log.info(messages.NoteSeen(note=note))
 
-    def _ended(self, step: Step, n: int) -> str:
-        """Which step of reactor n's schedule this sample ended, and why."""
+    def _ended(self, step: Step, n: int) -> messages.StepEnded:
+        """Say which step of reactor n's schedule this sample ended, and why."""
         k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
         start, end, _ = self._progress.steps(n)[k]
-        return f"step {k + 1} ended after {end - start:.0f} min: {self._progress.conditions.texts[n][k]}"
+        why = self._progress.conditions.texts[n][k]
+        return messages.StepEnded(reactor=self._names[n], step=k + 1, minutes=end - start, why=why, od=step.od[n])
 
     def _window(self, step: Step, n: int) -> None:
         """How well the window was held that ends with this step."""
         if self._samples[n]:
             mean = self._error[n] / self._samples[n]
-            log.info("%s: window ends at minute %.0f, mean error %.4f OD", self._names[n], step.minute[n], mean)
+            log.info(messages.WindowEnds(reactor=self._names[n], minute=step.minute[n], error=mean))
         self._error[n] = self._samples[n] = 0.0
 
     def _who_decides(self, step: Step, n: int) -> None:

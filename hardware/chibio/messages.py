@@ -2,7 +2,7 @@
 
 from conf.messages import Message
 from hardware import messages as any_kind
-from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError
+from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, SensorError
 
 # fmt: off
 
@@ -145,3 +145,10 @@ class NotUnderstood(ProtocolError, says="device state: {what}"):
     """A torn answer, or another software: nothing if it is once; else look at the software's version."""
 class ExperimentRuns(DeviceStateError, says="{reactor}: an experiment is running",
     remedy="stop it before pumps are weighed"): ...
+class FaultsStand(DeviceStateError, says="{faults}"): ...
+class NotWarm(SensorError,
+    says="{reactor}: {temperature:.1f} degC after {minutes:.0f} min, not {target:g} +- {tolerance:g}",
+    remedy="check heater and lid, warm the medium first, or raise warm_up or tolerance"): ...
+class NoBlank(SensorError,
+    says="{reactor}: blank {counts:.0f} +- {sd:.0f} counts, allowed 3000 to 60000 with a scatter under 2 %",
+    remedy="check that the vial is seated, the medium clear and without bubbles"): ...
