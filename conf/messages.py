@@ -12,7 +12,7 @@ from functools import partial
 from string import Formatter
 from typing import Any, ClassVar, Self
 
-__all__ = ["Message", "names"]
+__all__ = ["Message", "NameTaken", "NoSuchKey", "NotAllowed", "names"]
 
 
 def names(kind: "type[Message]") -> set[str]:
@@ -61,3 +61,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Message):
         return value.row
     return value if isinstance(value, bool | int | float | str | None) else str(value)
+
+
+# fmt: off
+
+class NotAllowed(Message, ValueError, says="{key} = {given}: allowed {allowed}"):
+    """A value of a config or of a command line."""
+class NoSuchKey(Message, ValueError, says="{key}: no such key{hint}", remedy="allowed {where}: {known}"): ...
+class NameTaken(Message, ValueError, says="{what} {name}: there is one of this name already", remedy="choose another"):
+    """Told where something is added to those that come with the program."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from conf import presets
+from conf.messages import NotAllowed
 from dqn.policy import Policy
 from envs.bench import Bench
 from envs.coculture.pair import PairConfig
@@ -122,7 +123,7 @@ def _kind(kind: str, signal: str) -> LawKind:
         key = f"{GROUPS.get(signal, f'signals.{signal}')}.kind"
         missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(KINDS)}"
         allowed = ", ".join(KINDS.get(signal, {})) or missing
-        raise ValueError(f"{key} = {kind}: allowed {allowed}")
+        raise NotAllowed(key=key, given=kind, allowed=allowed)
     return KINDS[signal][kind]
 
 
@@ -135,7 +136,7 @@ def on_device(kind: str) -> str:
     """Return the law of the density, if it needs no simulated plant. Raises: ValueError naming those that do not."""
     known = [name for name, law in KINDS[DENSITY].items() if "plant" not in law.parts]
     if kind not in known:
-        raise ValueError(f"controller_kind = {kind}: allowed {', '.join(known)}")
+        raise NotAllowed(key="controller_kind", given=kind, allowed=", ".join(known))
     return kind
 
 

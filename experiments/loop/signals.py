@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.messages import NameTaken
 from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
@@ -264,7 +265,7 @@ def add(name: str, make: Make) -> None:
     Raises: ValueError for a name that is taken.
     """
     if name in (*TAKEN, *MAKERS):
-        raise messages.NameTaken(name=name)
+        raise NameTaken(what="signal", name=name)
     MAKERS[name] = make
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from conf.messages import NotAllowed
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.coculture.task import CocultureConfig
@@ -17,7 +18,7 @@ ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, 
 def env_schema(kind: str, key: str = "env") -> Any:
     """Return the default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
     if kind not in ENVS:
-        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(ENVS)}")
+        raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(ENVS))
     return ENVS[kind]()
 
 
@@ -27,7 +28,7 @@ AGENTS: dict[str, type[Any]] = {"dqn": DQNConfig}
 def agent_schema(kind: str, key: str = "agent") -> Any:
     """Return the default config of an agent of this kind, "": dqn. Raises: ValueError naming the kinds there are."""
     if (kind or "dqn") not in AGENTS:
-        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(AGENTS)}")
+        raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(AGENTS))
     return AGENTS[kind or "dqn"]()
 
 

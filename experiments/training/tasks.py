@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from conf import presets
+from conf.messages import NameTaken
 from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.policy import Policy
@@ -89,7 +90,7 @@ def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) ->
     Raises: ValueError for a kind that exists.
     """
     if kind in ENVS:
-        raise ValueError(f"env {kind}: there is one of this name already; choose another")
+        raise NameTaken(what="env", name=kind)
     presets.add(f"env/{kind}", {"kind": kind}, what)
     ENVS[kind], TASKS[config] = config, task
 
