@@ -10,13 +10,13 @@ import copy
 import math
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from difflib import get_close_matches
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from conf.messages import NoSuchKey, NotAllowed
 
-__all__ = ["Entry", "build", "check", "entries", "part", "require", "setting"]
+__all__ = ["Entry", "add", "build", "check", "entries", "part", "require", "setting"]
 
 T = TypeVar("T")
 
@@ -132,6 +132,40 @@ def setting(default: T, what: str, unit: str = "", within: tuple[float, float] |
 def part(factory: Callable[[], T], what: str, kinds: Kinds | None = None) -> T:
     """Declare a field that holds a config dataclass of its own; kinds: as of `Meaning`."""
     return field(default_factory=factory, metadata={"meaning": Meaning(what, kinds=kinds)})
+
+
+def add(to: type[Any], more: type[Any]) -> None:
+    """Give a config class further fields, behind its own; they are set, compared, checked and shown as its own are.
+
+    Args: more: a class with the fields, declared as in a config but for the decorator. Its `__post_init__` gets the
+      instances of `to`, before their own.
+    Raises: ValueError for a field that is there already.
+    """
+    own, hints = {f.name: f for f in fields(to)}, get_type_hints(more)
+    added = {name: vars(more)[name] for name in more.__annotations__}
+    for name, declared in added.items():
+        require(name not in own, f"a field of {to.__name__}", name, "a name of its own")
+        to.__annotations__[name] = hints[name]
+        made = declared.default_factory() if declared.default is MISSING else declared.default
+        setattr(to, name, made)  # of an instance that was made before
+    checks = [getattr(of, "__post_init__", None) for of in (more, to)]
+
+    def checked(self: Any) -> None:
+        for check_one in filter(None, checks):
+            check_one(self)
+
+    hints, again = get_type_hints(to), {name: field(**_said(f)) for name, f in (own | added).items()}
+    typed = [(name, hints[name], f) for name, f in again.items()]
+    whole = make_dataclass(to.__name__, typed, frozen=True, namespace={"__post_init__": checked})
+    for name in ("__init__", "__repr__", "__eq__", "__hash__", "__dataclass_fields__", "__match_args__"):
+        setattr(to, name, getattr(whole, name))
+    to.__post_init__ = checked
+
+
+def _said(f: Any) -> dict[str, Any]:
+    """Arguments of `field` that declare a field once more."""
+    given = {"default": f.default, "default_factory": f.default_factory}
+    return {"metadata": f.metadata, **{key: value for key, value in given.items() if value is not MISSING}}
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:

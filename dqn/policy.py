@@ -7,9 +7,9 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 | observation | what it is | actions |
 |---|---|---|
 | od, setpoint | OD x and setpoint r | pump rates, mL/s |
-| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | fractions of it
-|
-| logit_share, temperature, rate, logit_setpoint (, logit_next, minutes_to_change) | envs/coculture/task.py | degC |
+| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | parts of it |
+
+`add` makes other observations known.
 """
 
 import hashlib
@@ -23,16 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprints", "load",
-    "save",
+    "ABSOLUTE", "FORMAT", "RELATIVE", "Policy", "PolicyError", "add", "fingerprints", "load", "save",
 ]  # fmt: skip
 
 FORMAT = 2
 ABSOLUTE = ("od", "setpoint")
 RELATIVE = ("error", "growth_share")
-COCULTURE = ("logit_share", "temperature", "rate", "logit_setpoint")
-COCULTURE_PREVIEW = (*COCULTURE, "logit_next", "minutes_to_change")
-KNOWN = (ABSOLUTE, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
+_known: list[tuple[str, ...]] = [ABSOLUTE, RELATIVE]
+
+
+def add(*observation: str) -> None:
+    """Make an observation known, by its names: policies that see it can be read."""
+    if observation not in _known:
+        _known.append(observation)
 
 
 class PolicyError(Exception):
@@ -59,7 +62,7 @@ class Policy:
 
     @property
     def observation(self) -> tuple[str, ...]:
-        """Names of the inputs, one of `KNOWN`."""
+        """Names of the inputs, of those that are known."""
         return tuple(self.metadata["observation"])
 
     def q_values(self, observation: NDArray[Any]) -> NDArray[np.float32]:
@@ -138,8 +141,8 @@ def load(path: Path) -> Policy:
         metadata = json.loads(str(arrays["metadata"]))
         if metadata.get("format") != FORMAT:
             raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {FORMAT}; export it anew")
-        if tuple(metadata.get("observation", ())) not in KNOWN:
-            allowed = " or ".join(str(list(names)) for names in KNOWN)
+        if tuple(metadata.get("observation", ())) not in _known:
+            allowed = " or ".join(str(list(names)) for names in _known)
             raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
         layers = sum(name.startswith("w") for name in arrays)
         policy = Policy(

@@ -3,6 +3,8 @@
 Importing this package registers its environments (`gym_adapter.REGISTERED`) with Gymnasium.
 """
 
+from conf import guests
 from envs.gym_adapter import register
 
+guests.load("envs")
 register()

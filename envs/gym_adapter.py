@@ -10,14 +10,11 @@ from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv
 
 __all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 
-PREVIEW = {"control_min": 30.0, "episode_steps": 24, "preview_min": 360.0}
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
-    "Coculture-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", {}),
-    "CoculturePreview-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", PREVIEW),
 }
-"""Name -> single view, vector environment, values of the task that differ from its defaults."""
+"""Name -> single view, vector environment, values of the task that differ from its defaults; a guest adds its own."""
 
 
 class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):

@@ -1,6 +1,7 @@
-"""Schedule of a culture: phases, each with a setpoint, a temperature and possibly a composition."""
+"""Schedule of a culture: phases, each with a setpoint and a temperature."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +10,12 @@ from conf.schema import check, require, setting
 from envs.outputs import outputs_of
 from envs.until import Condition
 
-__all__ = ["Scenario"]
+__all__ = ["HEATED", "Scenario"]
 
 Array = NDArray[np.float64]
 
-ANNOUNCED_MIN = 360.0  # default announcement of a change of the composition
+HEATED: list[Callable[["Scenario"], bool]] = []
+"""Whether another controller decides on the temperature of a phase that gives none; a guest adds its own."""
 
 
 @dataclass(frozen=True)
@@ -21,34 +23,23 @@ class Scenario:
     """Consecutive phases, counted from the end of the recovery.
 
     If `until` gives a phase a condition, its minutes are a limit, and `edges`, `phase` and `at` assume that no
-    condition is met (`experiments/loop/progress.py` has the actual times). The setpoint of the share of B may be given
-    per phase, or as mean - amplitude sin(2 pi t / period), t since the end of the recovery. With such a setpoint the
-    composition controller sets the temperature, otherwise `temperatures` applies. Raises: ValueError with key, value
-    and allowed range.
+    condition is met (`experiments/loop/progress.py` has the actual times). Raises: ValueError with key, value and
+    allowed range.
     """
 
     setpoints: tuple[float, ...] = setting((0.5,), "setpoint of each phase", "OD", above=0.0, at_most=1.5)
     minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
     temperatures: tuple[float | None, ...] = setting(
-        (37.0,), "thermostat in each phase; null, two species: where both grow alike", "degC", within=(15, 42)
+        (37.0,), "thermostat in each phase; null: as another controller decides", "degC", within=(15, 42)
     )
     recovery_od: float = setting(
         0.0, "OD to which the culture grows undiluted before the first phase; 0: no recovery", "OD", within=(0, 1.5)
     )
     recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
-    ratios: tuple[float | None, ...] = setting(
-        (),
-        "setpoint of the share of B in each phase, null for none; empty: in no phase",
-        above=0.0,
-        below=1.0,
-    )
-    ratio_sine: tuple[float, ...] = setting(
-        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
-    )
     announce_min: float | None = setting(
         None,
-        "time by which controllers know a change of setpoint in advance; 0: never; null: 360 with a composition, else "
-        "0",
+        "time by which controllers know a change of setpoint in advance; 0: never; null: 0, or what a further setpoint "
+        "brings",
         "min",
         within=(0, 1440),
     )
@@ -69,7 +60,6 @@ class Scenario:
     settled_min: float = setting(10.0, "time without a reading outside that band", "min", within=(1, 1440))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
         phases, *beside = lengths = [len(each) for each in (self.setpoints, self.minutes, self.temperatures)]
         require(
             phases > 0 and set(beside) == {phases},
@@ -80,16 +70,19 @@ class Scenario:
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
-        alone = self.composed or None not in self.temperatures
-        require(alone, "scenario.temperatures", self.temperatures, "numbers where no share is asked for")
-        for name in ("until", "outputs", "ratios"):
-            given, phases = getattr(self, name), len(self.setpoints)
-            allowed = f"none or one for each of the {phases} phases"
-            require(len(given) in (0, phases), f"scenario.{name}", given, allowed)
+        given = None not in self.temperatures or any(heated(self) for heated in HEATED)
+        require(given, "scenario.temperatures", self.temperatures, "numbers where nobody else decides on them")
+        for name in ("until", "outputs"):
+            self.one_each(name)
         self._check_until()
         for text in self.outputs:
             outputs_of(text)
-        self._check_composition()
+
+    def one_each(self, name: str) -> None:
+        """Check that a list is empty or has an entry for each phase. Raises: ValueError."""
+        given, phases = getattr(self, name), len(self.setpoints)
+        allowed = f"none or one for each of the {phases} phases"
+        require(len(given) in (0, phases), f"scenario.{name}", given, allowed)
 
     def _check_until(self) -> None:
         for text in self.until:
@@ -97,34 +90,11 @@ class Scenario:
                 Condition(text)
             except ValueError as error:
                 raise ValueError(f"scenario.until: {error}") from None
-        if any(self.until):
-            why = "[] where a share is asked for, whose controller plans by the minutes"
-            require(not self.composed, "scenario.until", self.until, why)
-
-    def _check_composition(self) -> None:
-        if not self.ratio_sine:
-            return
-        require(not self.ratios, "scenario.ratios", self.ratios, "[] beside ratio_sine")
-        given = tuple(self.ratio_sine)
-        words = "mean, amplitude and period in min > 0, with |amplitude| < mean and |amplitude| < 1 - mean"
-        require(len(given) == 3 and given[2] > 0.0, "scenario.ratio_sine", given, words)
-        mean, amplitude, _ = given
-        require(abs(amplitude) < mean and mean + abs(amplitude) < 1.0, "scenario.ratio_sine", given, words)
-
-    @property
-    def composed(self) -> bool:
-        """Whether the schedule has a composition."""
-        return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
 
     @property
     def announced_min(self) -> float:
         """Time by which a change is announced, min; 0: never."""
-        usual = ANNOUNCED_MIN if self.composed else 0.0
-        return usual if self.announce_min is None else self.announce_min
-
-    def resting(self, even_c: float) -> "Scenario":
-        """Return the schedule with a temperature in every phase; the default is that of equal growth, degC."""
-        return replace(self, temperatures=tuple(even_c if t is None else t for t in self.temperatures))
+        return 0.0 if self.announce_min is None else self.announce_min
 
     @property
     def supplied(self) -> frozenset[int]:

@@ -11,7 +11,7 @@ from experiments.cli import completion
 from experiments.cli.start import version
 
 KINDS = {
-    "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
+    "From a recording to a reactor": ("demo", "calibrate", "replay", "train", "certify", "deploy", "report"),
     "At the device": ("calibrate_pump", "blank", "mark", "calibrate_pair"),
     "Side by side": ("benchmark", "score"),
 }

@@ -21,7 +21,6 @@ from experiments.calibration.twin_file import twin_yaml
 from experiments.cli import files, frame
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
-from hardware.storage.recording_reader import read_recording
 
 __all__ = ["body", "main"]
 
@@ -45,14 +44,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     source = config.data or str(resources.files("experiments") / "data" / "open_loop.csv")
     print(f"reading {config.data or 'the shipped recording'}", flush=True)
     with frame.refusing(RecordingError):
-        recording = read_recording(
-            source,
-            pump_ml_s=config.pump_ml_s,
-            pumps=config.pumps,
-            run=config.run,
-            reactor=config.reactor,
-            rows=_rows(config.rows),
-        )
+        recording = config.read(source)
     read = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
     raw = merged(read)
     if raw is not read:
@@ -93,12 +85,6 @@ def _write_twin(path: Path, behind: Twin, source: str) -> str:
         return f"no {path.name}: {str(error)[-200:]}"
     path.write_text(text, encoding="utf-8")
     return str(path)
-
-
-def _rows(rows: str | None) -> tuple[int, int | None]:
-    """FIRST:END as numbers; None is the end of the file."""
-    low, high = (rows or ":").split(":")
-    return int(low or 0), int(high) if high else None
 
 
 def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: str, segment_min: float) -> None:

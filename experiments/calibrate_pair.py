@@ -17,11 +17,11 @@ from envs.identification import curves
 from envs.identification.curves import Plateau, Polynomial
 from envs.identification.screening import Series
 from experiments.cli import files, frame
-from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.coculture.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.recordings.reader import Recording, read_recording
 from hardware.errors import RecordingError
 from hardware.storage.atomic import write
 from hardware.storage.marks import read_marks
-from hardware.storage.recording_reader import Recording, read_recording
 
 __all__ = ["CalibratePairConfig", "calibrate_pair", "main"]
 
@@ -205,8 +205,8 @@ def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
     head = "# Two species, written by calibrate_pair; for pair=FILE of train, deploy and benchmark.\n"
     plain = yaml.safe_dump(files.plain(asdict(pair)), sort_keys=False, allow_unicode=True)
     write(folder / "pair.yaml", head + plain)
+    from experiments.coculture.charts import pair_figure
     from experiments.reporting import charts
-    from experiments.reporting.composition_charts import pair_figure
 
     charts.save(pair_figure(pair, points), folder / "figures", "pair")
     rows = [[asdict(p) for p in mine] for mine in points]

@@ -62,7 +62,7 @@ def report(checks: Sequence[Check]) -> None:
 class Can:
     """What the reactors of a family can do.
 
-    fluorescence: measure it, by which a share is known. spare_pumps: numbers of those that give a fluid of their own.
+    fluorescence: measure it. spare_pumps: numbers of those that give a fluid of their own.
     thermostat: hold the temperature that a step asks for. regulation: hold an OD by themselves. resume: go on after the
     program was killed.
     """
@@ -162,11 +162,6 @@ class Family:
         Raises: UnfitError naming the backend, what it lacks or what differs, and the remedy.
         """
         where = f"backend={backend.kind}"
-        if any(s.composed for s in scenarios) and not self.can.fluorescence:
-            raise UnfitError(
-                f"scenario.ratios: {where} measures no fluorescence, by which a share is known; drop them or use a "
-                "Chi.Bio"
-            )
         asked = sorted({t for s in scenarios for t in s.temperatures if t is not None and math.isfinite(t)})
         if len(asked) > 1 and (lack := self.no_thermostat(backend)) is not None:
             degrees = f"{asked[0]:g} to {asked[-1]:g} degC"
@@ -212,8 +207,11 @@ class Family:
         heat = (THERMOSTAT,) if self.no_thermostat(backend) is None else ()
         return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
-    def coculture(self, backend: Any, pair: str) -> Any:
-        """Put vials of two species into a config that simulates vials that were left as they are. pair: which."""
+    def holding(self, backend: Any, preset: str, **values: Any) -> Any:
+        """Put a preset of vials into a config that simulates vials of its own, where none was chosen.
+
+        Args: values: further ones of the config.
+        """
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:

@@ -8,7 +8,10 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import settings
 
+from experiments.cli import extensions
 from tests.programs import spent_s
+
+extensions.load_all()
 
 settings.register_profile("busy", deadline=None)  # a machine may be busy with other things
 settings.load_profile("busy")

@@ -106,6 +106,25 @@ def test_no_circle_of_imports():
         pytest.fail(" -> ".join(circle.args[1]))
 
 
+GUEST_ROOMS = ("envs.coculture", "experiments.coculture", "experiments.calibrate_pair")
+GUEST_WORDS = re.compile(r"coculture|species|composition|pairconfig|of_pair", re.IGNORECASE)
+NAMED_ALL_THE_SAME = {
+    "conf.guests": "the one place where guests are registered",
+    "hardware.safety.config": "the thermostat's limits are the keys composition_low and composition_high",
+    "hardware.storage.marks": "a share that was counted is a column of marks.csv",
+    "experiments.mark": "and a key of the command",
+}
+
+
+def test_the_core_neither_imports_nor_names_a_guest():
+    """The rooms of guests are entered through what anybody may add, by the names in conf/guests.py alone."""
+    core = [m for m in modules() if not f"{m}.".startswith(tuple(f"{room}." for room in GUEST_ROOMS))]
+    named = {m for m in core if GUEST_WORDS.search(modules()[m].read_text(encoding="utf-8"))}
+    allowed = {m for m in core if f"{m}.".startswith(tuple(f"{place}." for place in NAMED_ALL_THE_SAME))}
+    assert named - allowed == set()
+    assert {place for place in NAMED_ALL_THE_SAME if not any(f"{m}.".startswith(f"{place}.") for m in named)} == set()
+
+
 def test_nobody_imports_a_command():
     for module in modules():
         wrong = {m for m in ours(module) if is_command(m)}

@@ -394,6 +394,7 @@ def test_what_a_command_begins_with_when_nothing_is_chosen():
         "benchmark": {"env": "sim"}, "blank": {"backend": "chibio"}, "calibrate": {}, "calibrate_pair": {},
         "calibrate_pump": {"backend": "chibio"}, "certify": {}, "mark": {}, "report": {},
         "score": {"env": "sim"}, "train": {"env": "sim", "agent": "tuned"},
+        "replay": {"safety": "default", "controller": "dqn"},
         "deploy": {
             "backend": "sim", "plant": "nominal_noise", "safety": "default", "controller": "dqn",
             "scenario": "setpoint_steps",

@@ -1,4 +1,4 @@
-"""Growth and pigment of one species against temperature, from what recordings show at temperatures that were held."""
+"""Growth and pigment of one strain against temperature, from what recordings show at temperatures that were held."""
 
 from dataclasses import dataclass
 

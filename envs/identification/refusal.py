@@ -13,6 +13,8 @@ from envs.identification.window import longest
 __all__ = ["GrowthAlone", "check_estimate", "growth_alone"]
 
 PLAUSIBLE_MU = (0.001, 0.06)  # 1/min, doubling in 11 h to 12 min
+FASTEST_MU = 0.1  # 1/min; no bacterium doubles in less than 7 min
+POSSIBLE_TAU = (0.01, 10.0)  # a pump of 1 mL/s at 0.6 to 600 mL
 WIDEST_TAU = 0.3  # half width of 1/tau over its value, of a pair that is returned
 STEEPEST_HILLS = 3.0  # spread of 1/tau between points of the noise model over that within one
 NARROW = 0.1  # half width of an interval over its value, below which hills do not matter
@@ -30,6 +32,16 @@ def check_estimate(found: Estimate, series: Series) -> None:
     """
     rows = f"rows {series.row[0]}-{series.row[-1]}"
     k, mu = found.inverse_tau, found.mu
+    if mu.low > FASTEST_MU:
+        raise NotIdentifiable(
+            f"{rows}: mu = {mu.value:.3g} 1/min, a doubling in {np.log(2.0) / mu.value:.2g} min: no culture grows so",
+            "check the unit of time (time_unit=)",
+        )
+    if k.low > 0.0 and not POSSIBLE_TAU[0] <= 1.0 / k.value <= POSSIBLE_TAU[1]:
+        raise NotIdentifiable(
+            f"{rows}: tau = {1.0 / k.value:.3g}: allowed {POSSIBLE_TAU[0]:g} to {POSSIBLE_TAU[1]:g}",
+            "check the unit of the doses or of the pump's rate (pump_ml_s=)",
+        )
     if found.condition > WORST_CONDITION:
         raise NotIdentifiable(f"{rows}: the pump's rate hardly changes, so growth and dilution cannot be told apart")
     if k.half_width > 10.0 * abs(k.value):

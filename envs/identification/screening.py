@@ -107,13 +107,13 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def merged(series: Series) -> Series:
-    """Merge rows of half a minute and less, where there are more rows than a week has minutes.
+def merged(series: Series, longest: int = WEEK_MIN) -> Series:
+    """Merge rows of half a minute and less, where there are more of them than `longest`: than a week has minutes.
 
     A merged row stands at its last reading, with the median of the readings of the 18 s up to there, so that no dose
     between two readings changes sides; the pump's volume is kept.
     """
-    if len(series.time) <= WEEK_MIN:
+    if len(series.time) <= longest:
         return series
     minute = np.floor(series.time - series.time[0]).astype(np.int64)
     first = np.flatnonzero(np.diff(minute, prepend=-1))

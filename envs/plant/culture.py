@@ -1,18 +1,17 @@
 """The culture: suspended cells, their substrate, and biomass on the wall."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.coculture.pair import PairConfig
 from envs.growth import Exponential, GrowthLaw, Monod
 from envs.integrators import Integrator
 from envs.plant.course import along, check_knots
-from envs.plant.noise import Streams, spread, uniform
-from envs.plant.species import TEMPERATURE_LAWS, SecondSpeciesConfig, response
+from envs.plant.strains import TEMPERATURE_LAWS, Strain
 
 __all__ = ["Culture", "GrowthConfig"]
 
@@ -72,63 +71,41 @@ class GrowthConfig:
 
 
 class Culture:
-    """N cultures of S species: suspended biomass x, relative substrate s, wall biomass w (OD or relative to medium).
+    """N cultures of S strains: suspended biomass x, relative substrate s, wall biomass w (OD or relative to medium).
 
       x_i' = (m_i - D) x_i - ka x_i + kd w_i        s' = D (1 - s) - sum_i m_i x_i / Y
       w_i' = ka x_i + r m_i w_i (1 - sum_i w_i / W) - kd w_i
-      m_i  = mu_i(s) phi_i(T), times drift, stirring, `mu_factor` and its own `species_factor`
+      m_i  = mu_i(s) phi_i(T), times drift, stirring, `mu_factor` and its own `strain_factor`
       D    = fresh medium per minute / volume
 
     Args:
-      config: growth; rngs: one stream per vial, for its growth rate.
-      integrate: integrator.
-      second: a second species, S = 2; second_rngs: one stream per vial, for its draws.
-      pair: curves of both, for `temperature_law=pair`.
+      config: growth; strains: S of them; integrate: integrator.
     State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
     and `stir_factor` (1 turning, 0 stopped; for a failed stirrer, not for the still phase of each cycle); and
-    `species_factor`, (N, S).
+    `strain_factor`, (N, S).
     """
 
-    def __init__(
-        self,
-        config: GrowthConfig,
-        rngs: Streams,
-        integrate: Integrator,
-        second: SecondSpeciesConfig,
-        second_rngs: Streams,
-        pair: PairConfig,
-    ) -> None:
-        self.config, self._n = config, len(rngs)
+    def __init__(self, config: GrowthConfig, strains: Sequence[Strain], integrate: Integrator) -> None:
+        self.config, self.strains, self._n = config, strains, strains[0].mu.size
         self._integrate = integrate
-        self.draws: dict[str, Array] = {"mu": spread(rngs, config.mu, config.mu_cv)}
-        species: list[GrowthConfig | SecondSpeciesConfig] = [config]
-        rates = [self.draws["mu"]]
-        if second.present:
-            species.append(second)
-            rates.append(spread(second_rngs, second.mu, second.mu_cv))
-            self.draws |= {"second_mu": rates[1], "second_share": uniform(second_rngs, *second.start_share)}
-        mu = np.stack(rates, axis=1)
+        mu = np.stack([strain.mu for strain in strains], axis=1)
         # Quoted for fresh medium: Monod's rate at s = 1 is mu_max / (1 + k_s).
         endless = np.isinf(config.yield_od)
         self._law: GrowthLaw = Exponential(mu) if endless else Monod(mu * (1.0 + config.k_s), config.k_s)
-        self._responses = [
-            response(a.temperature_law, a.activation_kj_mol, pair.curve(k)) for k, a in enumerate(species)
-        ]
-        self._lags_min = [a.adaptation_min for a in species]
         self.mu_factor, self.stir_factor = np.ones(self._n), np.ones(self._n)
-        self.species_factor = np.ones((self._n, len(species)))
+        self.strain_factor = np.ones((self._n, len(strains)))
 
     def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
         """Start a new culture in balance with its medium.
 
-        Args: OD and degC, scalar or shape (N,). share: share of B, as `od`; None: as drawn.
+        Args: OD and degC, scalar or shape (N,). share: share of the second strain, as `od`; None: as drawn.
         """
         total = np.broadcast_to(od, (self._n,)).copy()
-        shares = [total]
-        if len(self._responses) > 1:
-            r = np.broadcast_to(self.draws["second_share"] if share is None else share, (self._n,))
-            shares = [total * (1.0 - r), total * r]
-        self.biomass: Array = np.stack(shares, axis=1)
+        others = [strain.share for strain in self.strains[1:]]
+        if others and share is not None:
+            others[0] = np.broadcast_to(share, (self._n,))
+        parts = [total * (1.0 - sum(others)), *(total * r for r in others)] if others else [total]
+        self.biomass: Array = np.stack(parts, axis=1)
         self.substrate: Array = np.maximum(1.0 - total / self.config.yield_od, 0.0)
         self._wall = np.zeros_like(self.biomass)
         self._adapted = self._phi(np.broadcast_to(temperature, (self._n,)))
@@ -136,18 +113,18 @@ class Culture:
 
     @property
     def od(self) -> Array:
-        """True suspended biomass of all species, OD, shape (N,)."""
+        """True suspended biomass of all strains, OD, shape (N,)."""
         return np.asarray(self.biomass.sum(axis=1))
 
     @property
     def wall(self) -> Array:
-        """Biomass of all species on the wall, OD-equivalent, shape (N,)."""
+        """Biomass of all strains on the wall, OD-equivalent, shape (N,)."""
         return np.asarray(self._wall.sum(axis=1))
 
     @property
     def share(self) -> Array:
-        """Share of B, x_2 / (x_1 + x_2), shape (N,); nan without a second species or without biomass."""
-        if len(self._responses) == 1:
+        """Share of the second strain, shape (N,); nan without one or without biomass."""
+        if len(self.strains) == 1:
             return np.full(self._n, np.nan)
         od = self.od
         return np.asarray(np.divide(self.biomass[:, 1], od, out=np.full(self._n, np.nan), where=od > 0.0))
@@ -171,13 +148,15 @@ class Culture:
           dilution: 1/min; temperature: degC; age_min: of the culture, min; all of shape (N,).
         """
         g, d = self.config, dilution[:, None]
-        follow = [1.0 if lag == 0.0 else -np.expm1(-minutes / lag) for lag in self._lags_min]
+        follow = [
+            1.0 if lag == 0.0 else -np.expm1(-minutes / lag) for lag in (strain.lag_min for strain in self.strains)
+        ]
         self._adapted = self._adapted + (self._phi(temperature) - self._adapted) * np.array(follow)
         relative = self._relative_rate(age_min)
-        species = len(follow)
+        n = len(follow)
 
         def derivative(y: Array) -> Array:
-            x, s, w = y[:, :species], y[:, species : species + 1], y[:, species + 1 :]
+            x, s, w = y[:, :n], y[:, n : n + 1], y[:, n + 1 :]
             rate = self._law.specific_rate(np.broadcast_to(s, x.shape)) * relative
             exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
             crowded = 1.0 - w.sum(axis=1, keepdims=True) / g.wall_capacity_od
@@ -188,14 +167,14 @@ class Culture:
 
         state = np.concatenate([self.biomass, self.substrate[:, None], self._wall], axis=1)
         state = np.maximum(self._integrate(derivative, state, minutes, self.substeps(minutes)), 0.0)
-        self.biomass, self.substrate, self._wall = state[:, :species], state[:, species], state[:, species + 1 :]
+        self.biomass, self.substrate, self._wall = state[:, :n], state[:, n], state[:, n + 1 :]
 
     def substeps(self, minutes: float) -> int:
         """Return the number of integration steps in `minutes`."""
         return max(1, int(np.ceil(minutes / SUBSTEP_MIN - 1e-9)))
 
     def rates(self, age_min: Array) -> Array:
-        """Return the current specific growth rate of each species, 1/min, shape (N, S).
+        """Return the current specific growth rate of each strain, 1/min, shape (N, S).
 
         Args: age_min: of the culture, min, shape (N,).
         """
@@ -203,8 +182,8 @@ class Culture:
         return self._law.specific_rate(substrate) * self._relative_rate(age_min)
 
     def _phi(self, temperature: Array) -> Array:
-        """phi_i(T) of every species, shape (N, S)."""
-        return np.stack([phi(temperature) for phi in self._responses], axis=1)
+        """phi_i(T) of every strain, shape (N, S)."""
+        return np.stack([strain.phi(temperature) for strain in self.strains], axis=1)
 
     def _relative_rate(self, age_min: Array) -> Array:
         """Combine temperature, drift, stirring and both factors into a factor of the growth rates, shape (N, S)."""
@@ -212,7 +191,7 @@ class Culture:
         course = along(g.knots_min, g.knots_mu, g.mu, age_min)
         drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course
         stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
-        factors = self.mu_factor[:, None] * self.species_factor
+        factors = self.mu_factor[:, None] * self.strain_factor
         return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * factors)
 
     def settle(self, minutes: float) -> None:

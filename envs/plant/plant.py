@@ -4,7 +4,9 @@ It is not the training model. It shares the growth-law interface with it and not
 everything real is switched off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +14,17 @@ from numpy.typing import NDArray
 from conf.messages import NotAllowed
 from conf.schema import check, part, setting
 from envs.bench import Bench
-from envs.coculture.pair import PairConfig
-from envs.growth import REFERENCE_TEMPERATURE
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
 from envs.plant.disturbance import named
-from envs.plant.fluorescence import FluorescenceConfig, FluorescenceSensor
-from envs.plant.noise import Streams, Tape, streams, uniform
+from envs.plant.noise import Streams, Tape, spread, streams, uniform
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
-from envs.plant.species import SecondSpeciesConfig
+from envs.plant.strains import Strain, response
 from envs.plant.thermal import Thermal, ThermalConfig
 from envs.plant.vessel import Vessel, VesselConfig
 
-__all__ = ["Plant", "PlantConfig"]
+__all__ = ["LIGHTS", "STRAINS", "TOLD", "LightSensor", "Plant", "PlantConfig", "told"]
 
 Array = NDArray[np.float64]
 
@@ -38,10 +37,7 @@ class PlantConfig:
     pump: PumpConfig = part(PumpConfig, "flow of the pumps")
     sensor: SensorConfig = part(SensorConfig, "errors of an OD reading")
     vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
-    pair: PairConfig = part(PairConfig, "curves and pigment of two species, for temperature_law=pair")
     thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
-    second: SecondSpeciesConfig = part(SecondSpeciesConfig, "a second species in the vial")
-    fluorescence: FluorescenceConfig = part(FluorescenceConfig, "fluorescence of the second species, and its sensor")
     start_od: float = setting(0.5, "OD at reset unless the scenario sets it", "OD", within=(0, 10))
     start_temperature: float = setting(
         37.0, "temperature of vial and thermostat at reset unless the scenario sets it", "degC", within=(0, 60)
@@ -62,14 +58,42 @@ class PlantConfig:
             named(name)
 
 
-def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
-    """Give a plant the species of another pair: each grows in proportion to its new curve as it did to its old one."""
-    if pair == config.pair:
-        return config
-    by = pair.rates(REFERENCE_TEMPERATURE) / config.pair.rates(REFERENCE_TEMPERATURE)
-    first = replace(config.growth, mu=config.growth.mu * float(by[0]), adaptation_min=pair.first.lag_min)
-    second = replace(config.second, mu=config.second.mu * float(by[1]), adaptation_min=pair.second.lag_min)
-    return replace(config, pair=pair, growth=first, second=second, start_temperature=pair.even_c)
+def told(config: PlantConfig, values: Mapping[str, str]) -> PlantConfig:
+    """Change a config as the vials are told. Args: values: by keys of `TOLD`. Raises: ValueError."""
+    for key, (usual, _, change) in TOLD.items():
+        config = change(config, values.get(key, usual))
+    return config
+
+
+class LightSensor(Protocol):
+    """What is seen of light that a strain gives, N vials. draws: what was drawn once; strain: its number."""
+
+    draws: dict[str, Array]
+    strain: int
+
+    def reset(self, producers: Array, growth: Array, temperature: Array) -> None:
+        """Start anew. Args: producers: OD of the strain; growth: its rate, 1/min; temperature: degC."""
+
+    def new_minute(self, temperature: Array) -> None:
+        """Begin a minute at a temperature, degC."""
+
+    def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
+        """Pass an interval, min.
+
+        Args: producers: mean OD of the strain. kept: share that a dose at its start leaves; dilution: 1/min, during it;
+          concentrated: by evaporation, at its end.
+        """
+
+    def read(self, od: Array, minutes: float) -> Array:
+        """Take one reading, counts. Args: od: of all cells; minutes: since reset."""
+
+
+STRAINS: list[Callable[[PlantConfig, Streams], tuple[Sequence[Strain], dict[str, Array]]]] = []
+"""From the config and a stream per vial, further strains and what was drawn of them; a guest adds its own."""
+TOLD: dict[str, tuple[str, str, Callable[[PlantConfig, str], PlantConfig]]] = {}
+"""What vials are told beside their preset: key -> usual value, meaning, what it makes of the config; of guests."""
+LIGHTS: list[Callable[[PlantConfig, Streams], LightSensor | None]] = []
+"""From the config and a stream per vial, the sensor of a strain's light, if there is one; a guest adds its own."""
 
 
 class Plant:
@@ -109,16 +133,21 @@ class Plant:
         once, process, reading, start, second, light, thermometer = ([p[k] for p in parts] for k in range(7))
         # The parts draw from the same streams: their order belongs to what a seed means.
         integrate = INTEGRATORS[config.integrator]
-        self.culture = Culture(config.growth, once, integrate, config.second, second, config.pair)
+        mu, draws = spread(once, config.growth.mu, config.growth.mu_cv), dict[str, Array]()
+        own = response(config.growth.temperature_law, config, config.growth.activation_kj_mol, 0)
+        strains = [Strain(mu, own, config.growth.adaptation_min, np.ones(n))]
+        for make in STRAINS:
+            more, drawn = make(config, second)
+            strains, draws = [*strains, *more], draws | drawn
+        self.culture = Culture(config.growth, strains, integrate)
         self.vessel = Vessel(config.vessel, config.pump, once, np.full(n, volume_ml, dtype=np.float64))
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)
         self.thermal = Thermal(config.thermal, thermometer)
         self.feed.media_left_ml[:] = config.vessel.media_ml
-        self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws | self.thermal.draws
-        self.fluorescence = (
-            FluorescenceSensor(config.fluorescence, light, config.pair) if config.second.present else None
-        )
+        self.draws = {"mu": mu} | draws | self.vessel.draws | self.feed.draws | self.sensor.draws | self.thermal.draws
+        lights = [sensor for make_light in LIGHTS if (sensor := make_light(config, light)) is not None]
+        self.fluorescence = lights[0] if lights else None
         if self.fluorescence is not None:
             self.draws |= self.fluorescence.draws
         self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)
@@ -137,7 +166,7 @@ class Plant:
         Args:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
           temperature: of vial and thermostat, degC, as `od`; None = `start_temperature` of the config.
-          share: of the second species, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
+          share: of the second strain, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
         Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below
         0 or a share outside 0 to 1.
         """
@@ -154,8 +183,9 @@ class Plant:
         self.minutes = 0.0
         self._minute = -1
         if self.fluorescence is not None:
-            growth = self.culture.rates(self.age_min)[:, 1]
-            self.fluorescence.reset(self.culture.biomass[:, 1], growth, self.thermal.temperature)
+            which = self.fluorescence.strain
+            growth = self.culture.rates(self.age_min)[:, which]
+            self.fluorescence.reset(self.culture.biomass[:, which], growth, self.thermal.temperature)
 
     def advance(
         self,
@@ -217,7 +247,7 @@ class Plant:
         concentrated = self.vessel.evaporate(minutes)
         if self.fluorescence is not None:
             washed_out = kept if self.config.pump.dosing == "pulse" else np.ones(self.n)
-            producers = 0.5 * (before + self.culture.biomass)[:, 1]
+            producers = 0.5 * (before + self.culture.biomass)[:, self.fluorescence.strain]
             self.fluorescence.advance(minutes, producers, washed_out, dilution, concentrated)
         self.culture.concentrate(concentrated)
         self.culture.settle(minutes)
@@ -239,7 +269,7 @@ class Plant:
     def expected_od(self, minutes: float, feed_s: Array) -> Array:
         """Suspended biomass after an interval without surprises, OD, (A, N); changes nothing.
 
-        Each species grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is
+        Each strain grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is
         diluted by the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
 
         Args:
@@ -279,7 +309,7 @@ class Plant:
         return self.sensor.apparent(self.culture.in_light_path, self.culture.wall, self.minutes)
 
     def read_fluorescence(self) -> Array:
-        """One reading of every fluorescence sensor, counts, shape (N,); nan where there is no second species."""
+        """One reading of every fluorescence sensor, counts, shape (N,); nan where nothing gives light."""
         if self.fluorescence is None:
             return np.full(self.n, np.nan)
-        return self.fluorescence.read(self.culture.od, self.minutes)
+        return np.asarray(self.fluorescence.read(self.culture.od, self.minutes))

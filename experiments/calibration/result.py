@@ -14,7 +14,7 @@ from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
 from envs.task import EnvConfig
 from experiments.calibration.twin_file import yaml_line
-from hardware.storage.recording_reader import Recording
+from experiments.recordings.reader import Recording
 
 __all__ = ["environment_yaml", "refusal", "report", "summary"]
 
@@ -156,6 +156,11 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
             f"  held out    PMSE {v.holdout_pct:.3g} % over the window's last 30 % with the pair of the first 70 %, "
             f"{v.early_pct:.3g} % over its own rows; an hour ahead each"
         )
+    lines += [
+        f"  {a.minutes:.0f} min ahead {a.model_pct:.2g} % rms, the first half predicts the second; the OD stays: "
+        f"{a.od_stays_pct:.2g} %; the slope of 20 min goes on: {a.same_slope_pct:.2g} %"
+        for a in v.ahead
+    ]
     if v.outside_pct is not None:
         lines.append(
             f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, started afresh"

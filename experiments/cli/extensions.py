@@ -17,7 +17,7 @@ from traceback import walk_tb
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from conf import presets
+from conf import guests, presets
 from experiments.cli import files
 
 __all__ = ["VARIABLE", "keep", "kept", "load_all", "offer", "preset_file", "taken"]
@@ -45,7 +45,11 @@ def _remember(paths: Sequence[str]) -> None:
 
 
 def load_all() -> None:
-    """Load every file that `TURBIDOSTAT_EXTEND` names and that is not loaded yet. Raises: ValueError as `taken`."""
+    """Load the guests, and every file that `TURBIDOSTAT_EXTEND` names and that is not loaded yet.
+
+    Raises: ValueError as `taken`.
+    """
+    guests.load("experiments")
     for name in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
         _load(Path(name))
 

@@ -13,6 +13,7 @@ import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, chosen, commands, groups, owners, sentence
 from conf.schema import Entry, entries
+from experiments.cli import extensions
 from experiments.cli.frame import EntryPoint
 from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
@@ -20,6 +21,7 @@ from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
 
+ELSEWHERE = ("env", "agent")  # kinds that docs/tasks.md and docs/extending.md describe
 SINGULAR = {"studies": "study"}  # the others lose their s
 HEAD = """# Configuration
 
@@ -37,6 +39,7 @@ part is written with the part's name before it: `bench.max_rate=0.01`.
 
 def page() -> str:
     """Write the whole page."""
+    extensions.load_all()
     known: dict[str, EntryPoint[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
     parts: dict[type[Any], str] = {}
     for command in known.values():
@@ -70,12 +73,12 @@ def _anchor(heading: str) -> str:
 
 
 def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
-    """Yield the command's config with every kind of backend and controller that it may hold."""
+    """Yield the command's config with every kind of part that it may hold."""
     yield command.config()
-    for group in ("backend", "controller", "composition"):
-        if group in chosen(command.name):
-            for option in groups()[group]:
-                yield command.config([f"{group}={option}"])
+    several = [entry.name for entry in entries(command.schema) if entry.said.kinds and entry.name not in ELSEWHERE]
+    for group in (name for name in several if name in chosen(command.name)):
+        for option in groups()[group]:
+            yield command.config([f"{group}={option}"])
 
 
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:

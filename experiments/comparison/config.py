@@ -22,11 +22,6 @@ class StudyConfig:
     scenarios: tuple[str, ...] = setting(("setpoint_steps",), "names of scenarios")
     plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
     controllers: tuple[str, ...] = setting(("dqn", "pi", "mpc"), "names of controllers")
-    compositions: tuple[str, ...] = setting(
-        (), "names of composition controllers; `controllers` then control the density beside each of them"
-    )
-    announced: bool = setting(True, "composition: announce changes in advance, as the scenario says")
-    calibrated: bool = setting(False, "composition: each reactor has a calibrated light sensor")
 
 
 @dataclass(frozen=True)
@@ -52,25 +47,18 @@ class BenchmarkConfig:
     )
     calibration: bool = setting(False, "simulate and fit the open-loop protocol (Fig. 2a)")
     training: bool = setting(False, "train all agents, also those that no study needs (Fig. 2b)")
-    pair: str = setting(
-        "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
-    )
     plants: dict[str, PlantConfig] = setting({}, "plants by name")
     plant_file: str | None = setting(
         None, "a twin.yaml of calibrate, as plant `twin`; each vial starts at a random time within its knots"
     )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
     controllers: dict[str, Any] = setting({}, "controllers by name", kinds=registry.config_at)
-    compositions: dict[str, Any] = setting({}, "composition controllers by name", kinds=registry.config_at)
-    composition_policies: dict[str, str] = setting(
-        {}, "policies of learned composition controllers by name: `shipped`, a policy.npz or a run folder"
-    )
     studies: dict[str, StudyConfig] = setting({}, "comparisons by name; the recipes of experiment/ define them")
 
     def __post_init__(self) -> None:
         check(self)
         for name, study in self.studies.items():
-            for key in ("scenarios", "plants", "controllers", "compositions"):
+            for key in ("scenarios", "plants", "controllers"):
                 known = [*getattr(self, key)]
                 if key == "plants":
                     known += [TWIN if self.plant_file else f"{TWIN} (with plant_file=FILE)"]
@@ -85,22 +73,6 @@ class BenchmarkConfig:
                 scenario.until or scenario.outputs,
                 "no until and no outputs in a comparison",
             )
-        for name in self.composition_policies:
-            learned = [k for k, c in self.compositions.items() if registry.takes(c.kind, "policy", registry.SHARE)]
-            require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")
-        composed = [name for name, study in self.studies.items() if study.compositions]
-        same = len(composed) in (0, len(self.studies))
-        require(same, "studies", ", ".join(self.studies), "all with compositions, or none: their numbers differ")
-        for name in composed:
-            study = self.studies[name]
-            asks = [key for key, s in self.scenarios.items() if s.composed]
-            two = [key for key, p in self.plants.items() if p.second.present]
-            for key, given, having, known in (
-                ("scenarios", study.scenarios, "those with ratios", asks),
-                ("plants", study.plants, "those with two species", two),
-            ):
-                wrong = next((one for one in given if one not in known), None)
-                require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}: {', '.join(known)}")
         met = any(TWIN in study.plants for study in self.studies.values())
         wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
         require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)

@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 
 from experiments.comparison.config import TABLE_2
 from experiments.comparison.page import law_of
-from experiments.comparison.trials import DensityTrial, ShareTrial
+from experiments.comparison.trials import DensityTrial
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
 from experiments.reporting.tables import clock
 
-__all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours", "share_errors", "shares"]
+__all__ = ["LONG_MIN", "bands", "by_plant", "differences", "estimate", "plants", "published_and_ours"]
 
 Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK_MIN = 10.0
-STEP = 5  # minutes between the points of a share's curve
 LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
 NOISELESS = 1e-5  # scores below are those of a plant without noise
 
@@ -52,7 +51,7 @@ def _handles(controllers: Sequence[str]) -> list[Line2D]:
     return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
 
 
-def _estimate(
+def estimate(
     ax: Axes, mark: tuple[str, str], y: float, value: float, interval: Sequence[float], hollow: bool = False
 ) -> None:
     """Draw a law's mark with its 95 % interval, where it has one."""
@@ -130,11 +129,11 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
         for metric, ax in (("ise", left), ("itae", right)):
             for p in (p for p in TABLE_2 if p.controller == controller):
                 y = cells.index((p.scenario, p.window)) + 0.24 * (k - 1)
-                _estimate(ax, _mark(controller), y, getattr(p, metric), (np.nan, np.nan), hollow=True)
+                estimate(ax, _mark(controller), y, getattr(p, metric), (np.nan, np.nan), hollow=True)
                 for r in rows:
                     if (r["controller"], r["scenario"], r["window"]) == (controller, p.scenario, p.window):
                         low, high = r[f"{metric}_ci95"]
-                        _estimate(ax, _mark(controller), y, r[f"{metric}_mean"], (max(low, LEAST), high))
+                        estimate(ax, _mark(controller), y, r[f"{metric}_mean"], (max(low, LEAST), high))
     low_ise = min([p.ise for p in TABLE_2] + [r["ise_mean"] for r in rows])
     left.set(xscale="log", xlabel="ISE (T = 1 min), OD² min", xlim=(0.6 * low_ise, None))
     left.set_yticks(range(len(cells)), names)
@@ -149,7 +148,7 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _by_plant(
+def by_plant(
     entries: Sequence[Mapping[str, Any]], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
 ) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
     """Empty panels, one per metric, with a striped row per plant; returns also the height of an entry.
@@ -196,13 +195,13 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     # Whose floor is drawn: all controllers met the same sensors, so their floors nearly agree.
     witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
-    figure, axes, height = _by_plant(entries, [*_handles(_controllers(entries)), floor_line])
+    figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), floor_line])
     for metric, unit, ax in zip(("ise", "itae"), ("ISE, OD² min", "ITAE, OD min²"), axes, strict=True):
         seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
         ax.set_xlim(0.6 * seen[seen > NOISELESS].min(), 1.8 * seen.max())
         for e in entries:
             low, high = e[f"{metric}_ci95"]
-            _estimate(ax, _mark(e["controller"]), height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
+            estimate(ax, _mark(e["controller"]), height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
             floor = e[f"floor_{metric}"]
             if e["controller"] == witness and floor > NOISELESS:
                 row = round(height(e))
@@ -219,14 +218,14 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """
     entries = [e for e in entries if e["controller"] != "hold"]
     open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")
-    figure, axes, height = _by_plant(entries, [*_handles(_controllers(entries)), open_mark])
+    figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), open_mark])
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         ax.axvline(0.0, color="black", linewidth=1.0)
         ax.set_xscale("symlog", linthresh=20.0)
         for e in (e for e in entries if e["metric"] == metric and np.isfinite(e["percent"])):
             scale = e["percent"] / e["difference"] if e["difference"] else 0.0
             hollow = e["verdict"] == "no difference shown"
-            _estimate(ax, _mark(e["controller"]), height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
+            estimate(ax, _mark(e["controller"]), height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
         wide = ax.get_xlim()[1] > 200.0
         few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
         ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
@@ -234,34 +233,4 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)
         ax.set_xlabel(f"{metric.upper()} minus that of {against}, %")
-    return figure
-
-
-def shares(trials: Sequence[ShareTrial]) -> Figure:
-    """Draw a column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
-    columns = len(trials)
-    figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
-    for k, trial in enumerate(trials):
-        top, bottom, hours = axes[k], axes[columns + k], trial.minute[::STEP] / 60.0
-        for ax, values, colour in ((top, trial.share, COLOURS[0]), (bottom, trial.temperature, COLOURS[1])):
-            low, middle, high = np.quantile(values[:, ::STEP], (0.05, 0.5, 0.95), axis=0)
-            ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
-            ax.plot(hours, middle, color=colour, linewidth=1.2)
-        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
-        top.set_title(law_of({"controller": trial.cell.controller, "preview": trial.foresight}))
-        bottom.set_xlabel("hours")
-    axes[0].set(ylabel="share of the second species", ylim=(0.0, 1.0))
-    axes[columns].set_ylabel("vial, °C")
-    return figure
-
-
-def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Error of every law on every plant of one scenario: mean and 95 % interval."""
-    labels = list(dict.fromkeys(law_of(e) for e in entries))
-    marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
-    handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
-    figure, (ax,), height = _by_plant(entries, handles, 9.0, 1)
-    for e in entries:
-        _estimate(ax, marks[law_of(e)], height(e), e["ratio_abs_error_mean"], e["ci95"])
-    ax.set(xlabel="mean |r - setpoint|", xlim=(0.0, None))
     return figure

@@ -1,4 +1,4 @@
-"""The page of a benchmark: the paper's Table 2 beside the run's, every plant, what the learned policy loses; shares."""
+"""The page of a benchmark: the paper's Table 2 beside the run's, every plant, what the learned policy loses."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -6,11 +6,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from conf import guests
 from experiments.comparison.config import TABLE_2
 from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
-__all__ = ["SECTIONS", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "table_2"]
+__all__ = [
+    "RANKED", "SECTIONS", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "scaled",
+    "table_2",
+]  # fmt: skip
 
 Row = Mapping[str, Any]
 METRICS = ("ise", "itae")
@@ -47,19 +51,9 @@ ESTIMATES = (
     ("supervised_pct", "Decisions by the supervisor's law, %"),
     ("alarm_pct", "Decisions by it because of surprises, %"),
 )
-RANKED = {"density": ("itae_mean", "ITAE, OD min²"), "share": ("ratio_abs_error_mean", "mean |r - setpoint|")}
-"""Signal -> the measure by which a page says in short what is lowest, and its name."""
+RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
+"""Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
 OUT_OF_COMPETITION = ("oracle", "optimum")
-SHARE = {
-    "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
-    "for.",
-    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; the optimum knows "
-    "the whole program in either case.",
-    "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "
-    "5 counts; otherwise it begins from the mean of 17 real reactors.",
-    "paired": "law minus the vendor's PI, reactor by reactor: both meet the same vials, sensors and noise.",
-    "band covers": "share of all minutes in which the true share lies within the estimate's 95 % band.",
-}
 
 
 def law_of(entry: Row) -> str:
@@ -238,7 +232,7 @@ def _mean_sd(row: Row, metric: str, scale: float) -> str:
     return plus_minus(scale * row[f"{metric}_mean"], None if sd is None else scale * sd)
 
 
-def _scaled(row: Row, key: str, scale: float = 1.0) -> str:
+def scaled(row: Row, key: str, scale: float = 1.0) -> str:
     return number(None if row[key] is None else scale * row[key])
 
 
@@ -266,7 +260,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
             partial(_mean_sd, metric=metric, scale=scale),
             f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
             ranked_by=f"{metric}_mean",
-            floor=partial(_scaled, key=f"floor_{metric}", scale=scale),
+            floor=partial(scaled, key=f"floor_{metric}", scale=scale),
         )
         out.table(table)
     for against, heading in (
@@ -297,7 +291,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     )
     for key, title, ranked in extra:
         ranking = key if ranked else None
-        table = matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
+        table = matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), f"Mean, n = {n}.", ranking)
         out.table(table, folded=f"{title}: {scenario}")
 
 
@@ -306,7 +300,7 @@ def estimates(out: Page, summary: Row, scenario: str) -> None:
     totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
     for key, title in ESTIMATES if totals else ():
         note = f"{scenario}; mean, n = {totals[0]['n']}."
-        out.table(matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), note))
+        out.table(matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), note))
 
 
 def all_rows(summary: Row) -> Table:
@@ -344,7 +338,7 @@ def _interval(ci: Sequence[float | None]) -> str:
 def _in_short(out: Page, summary: Row) -> None:
     """Summarise: the learned policy beside the paper's, and the lowest of every scenario and plant."""
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] == "share")):
+    for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] != "density")):
         key, _ = RANKED[str(entry["signal"])]
         if entry.get(key) is not None and _runs(entry):
             laws = places.setdefault((entry["scenario"], entry["plant"]), {})
@@ -504,48 +498,6 @@ def _density(out: Page, summary: Row, run: Path) -> None:
             estimates(out, summary, scenario)
 
 
-def _lower(pair: Row) -> str:
-    low, high = pair["ci95"]
-    between = "" if low is None or low != low else f" [{low:+.4f}, {high:+.4f}]"
-    return f"{pair['difference']:+.4f}{between}, lower in {pair['lower_in']} of {pair['n']}"
-
-
-def _estimate(row: Row) -> str:
-    return f"{number(row['estimate_rms'])}, {100.0 * row['band_covers']:.0f} %"
-
-
-def _od(row: Row) -> str:
-    return f"{row['od_min']:.3f}, {row['od_mean']:.3f}, {row['od_max']:.3f}"
-
-
-def _share(out: Page, summary: Row, run: Path) -> None:
-    """Add a section of every scenario."""
-    errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
-    for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
-        out.section(scenario)
-
-        def add(
-            key: str, entries: Sequence[Row], title: str, text: Callable[[Row], str],
-            ranked_by: str | None = None, folded: str = "", scenario: str = scenario,
-        ) -> None:  # fmt: skip
-            entries = [e for e in entries if e["scenario"] == scenario]
-            if entries:
-                note = f"n = {entries[0]['n']} reactors each."
-                table = matrix(f"{scenario}_{key}", title, entries, text, note, ranked_by, laws_down=True)
-                out.table(table, folded=folded and f"{folded}: {scenario}")
-
-        rows = summary["rows"]
-        for ending, when in errors.items():
-            key = f"ratio_abs_error{ending or '_mean'}"
-            known = [r for r in rows if r[key] is not None]
-            add(key, known, f"Mean |r - setpoint|{when}", partial(_scaled, key=key), key)
-        add("paired", summary["paired"], "Difference to the vendor's PI", _lower)
-        add("estimate", rows, "Error of the estimate (rms), and how much its band covers", _estimate, folded="Estimate")
-        add("od", rows, "OD: least, mean, largest", _od, folded="OD")
-        for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
-            out.figure(run / f["file"], f["title"], f["caption"])
-
-
 class Section(NamedTuple):
     """What a page has of a signal: its title, what adds the sections, and the words that these use."""
 
@@ -556,12 +508,12 @@ class Section(NamedTuple):
 
 SECTIONS = {
     "density": Section("Turbidostat control: benchmark", _density, DENSITY),
-    "share": Section("Composition of two species: comparison", _share, SHARE),
 }
 
 
 def of_benchmark(run: Path) -> Page:
     """Build the page of a benchmark's run folder."""
+    guests.load("experiments.comparison")
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]
     out = Page(

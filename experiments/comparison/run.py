@@ -2,32 +2,37 @@
 
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from conf import guests
 from dqn import policy as policies
-from envs.plant.plant import PlantConfig, of_pair
+from envs.plant.plant import PlantConfig
 from experiments.certification import certificate
 from experiments.cli import files, frame
-from experiments.cli.calibrated import read_pair, read_plant_file
+from experiments.cli.calibrated import read_plant_file
 from experiments.comparison import page as pages
 from experiments.comparison import studies
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, Followed, Loops, cells
-from experiments.control.policies import composition_policy, find_policy, load_policy
-from experiments.laws import registry
+from experiments.control.policies import find_policy, load_policy
 from experiments.laws.density.learned import settings
 from experiments.reporting import charts, page
 from experiments.reporting.tables import count
 from experiments.training.config import TrainConfig
 
-__all__ = ["benchmark", "policies_of", "with_pair", "with_seeds", "with_twin"]
+__all__ = ["COMPLETED", "FOLLOWED", "benchmark", "with_seeds", "with_twin"]
 
 log = logging.getLogger(__name__)
+
+COMPLETED: list[Callable[[BenchmarkConfig], BenchmarkConfig]] = []
+"""What guests fill in."""
+FOLLOWED: dict[str, Callable[[BenchmarkConfig, Iterable[str], Path], Mapping[str, Followed | None]]] = {}
+"""Signal of a guest -> what each of its laws follows, if anything; the run folder keeps copies."""
 
 
 def learned(
@@ -112,35 +117,12 @@ def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
     return config
 
 
-def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Vials of the two species, and a temperature in every phase: by default that at which they grow alike."""
-    pair = read_pair(config.pair)
-    scenarios = {name: s.resting(pair.resting_c) for name, s in config.scenarios.items()}
-    plants = {name: of_pair(p, pair) if p.second.present else p for name, p in config.plants.items()}
-    return replace(config, scenarios=scenarios, plants=plants)
-
-
-def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
-    """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
-    found: dict[str, Followed | None] = {}
-    for name in names:
-        kept = folder / "policies" / name
-        kept.mkdir(parents=True, exist_ok=True)
-        where = config.composition_policies.get(name, "shipped")
-        policy = composition_policy(config.compositions[name].kind, where, kept, resumed=False)
-        if policy is not None:
-            try:
-                registry.build(config.compositions[name], registry.SHARE, policy=policy, pair=read_pair(config.pair))
-            except ValueError as error:
-                remedy = f"give composition_policies.{name}=RUN, or studies.NAME.compositions without {name}"
-                raise frame.UserError(f"{error}; {remedy}") from None
-        found[name] = None if policy is None else (policy, None)
-    return found
-
-
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
-    config = with_seeds(with_twin(with_pair(config)))
+    guests.load("experiments.comparison")
+    for completed in COMPLETED:
+        config = completed(config)
+    config = with_seeds(with_twin(config))
     wanted = cells(config)
     if not (wanted or config.training or config.calibration):
         raise frame.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
@@ -159,11 +141,12 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
             raise frame.UserError(f"calibration: {error}") from None
         keep(drawing)
     density = [cell for cell in wanted if cell.signal == "density"]
-    of_share = [cell for cell in wanted if cell.signal == "share"]
     names = {c.controller for c in density if config.controllers[c.controller].kind == "dqn"}
     with Loops(config) as loops:
-        for name, followed in policies_of(config, sorted({cell.controller for cell in of_share}), folder).items():
-            loops.start([cell for cell in of_share if cell.controller == name], followed)
+        for signal, policies_of in FOLLOWED.items():
+            own = [cell for cell in wanted if cell.signal == signal]
+            for name, followed in policies_of(config, sorted({cell.controller for cell in own}), folder).items():
+                loops.start([cell for cell in own if cell.controller == name], followed)
         loops.start([cell for cell in density if cell.controller not in names])  # they run while agents are trained
         found, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
         shown += learning

@@ -1,7 +1,6 @@
 """From trials to numbers: means with intervals, and paired differences between laws that met the same draws."""
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -9,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 from scipy.stats import t as student
 
-from experiments.comparison.trials import DensityTrial, ShareTrial, Trial, Window, windows
+from experiments.comparison.trials import DensityTrial, Trial, Window, windows
 
 __all__ = [
-    "ROWS", "SCORES", "Spread", "abs_error", "details", "last_hours", "pairs", "row", "rows", "share_row",
-    "total_pairs", "totals",
+    "ROWS", "SCORES", "Scored", "Spread", "details", "pairs", "row", "rows", "total_pairs", "totals",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -22,7 +20,6 @@ METRICS = ("ise", "itae")
 TOLD = {
     "supervised_pct": "supervised", "alarm_pct": "alarm", "error_2sd_pct": "error", "share_2sd_pct": "growth_share",
 }  # fmt: skip
-LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
 NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
 
 
@@ -52,20 +49,12 @@ class Spread:
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
 
 
-def _names(trial: Trial) -> dict[str, Any]:
-    cell = trial.cell
-    found: dict[str, Any] = {key: getattr(cell, key) for key in ("signal", "controller", "plant", "scenario")}
-    if isinstance(trial, ShareTrial):
-        found |= {"preview": trial.foresight, "density": cell.density, "calibrated": cell.calibrated}
-    return found
-
-
 def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
     """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
     settled = float(np.median(np.nan_to_num(score.settling_min, nan=np.inf)))  # "never" is infinity
-    return _names(trial) | {
+    return trial.names() | {
         "window": window.label,
         "setpoint": window.setpoint,
         "n": ise.n,
@@ -84,59 +73,14 @@ def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
 
 
 def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """List the rows of every trial: of a density one per window, of a share one."""
+    """List the rows of every trial, of a density one per window."""
     return [found for trial in trials for found in ROWS[trial.cell.signal](trial)]
-
-
-def abs_error(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| wherever a share is asked for, (N,)."""
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint), axis=1))
-
-
-def last_hours(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| of the last 2 h of every window, (N,); nan where the share asked for changes all the time.
-
-    A law that is told of a change leaves before it comes: then this says nothing of how well it holds.
-    """
-    held, edges = np.zeros(trial.minute.size, dtype=np.bool_), trial.schedule.edges.astype(int)
-    for start, end in pairwise(edges):
-        if np.unique(trial.setpoint[start:end]).size == 1 and np.isfinite(trial.setpoint[start]):
-            held[max(start, end - LAST_MIN) : end] = True
-    error = np.abs(trial.share - trial.setpoint)[:, held]
-    return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
-
-
-def _last_day(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| of the last day of a run of two days or more, else nan, (N,)."""
-    if trial.minute[-1] < 2 * DAY_MIN:
-        return np.full(len(trial.share), np.nan)
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, -DAY_MIN:], axis=1))
-
-
-def share_row(trial: ShareTrial) -> dict[str, Any]:
-    """Build the row of a share in summary.json, judged by the true share."""
-    error = Spread(abs_error(trial))
-    inside = (trial.low <= trial.share) & (trial.share <= trial.high)
-    return _names(trial) | {
-        "n": error.n,
-        "ratio_abs_error_mean": error.mean,
-        "ratio_abs_error_sd": error.sd,
-        "ci95": error.ci95,
-        "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
-        "ratio_abs_error_last_day": Spread(_last_day(trial)).mean,
-        "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
-        "band_covers": float(inside.mean()),
-        "od_min": float(trial.od.min()),
-        "od_max": float(trial.od.max()),
-        "od_mean": float(trial.od.mean()),
-    }
 
 
 ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
     "density": lambda trial: [row(trial, window) for window in windows(trial.schedule)],
-    "share": lambda trial: [share_row(trial)],
 }
-"""Signal -> the rows of one of its trials."""
+"""Signal -> the rows of one of its trials; a guest adds its own."""
 
 
 def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
@@ -146,7 +90,7 @@ def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
         for window in windows(trial.schedule):
             measured, clean, floor = (trial.score(window, of) for of in ("measured", "clean", "floor"))
             found.append(
-                _names(trial)
+                trial.names()
                 | {
                     "window": window.label,
                     "window_min": window.end - window.start,
@@ -175,7 +119,7 @@ def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     """One entry per trial: ISE and ITAE summed over its windows, and what it cost in medium and pump moves."""
     found = []
     for trial in trials:
-        entry = _names(trial) | {"n": int(trial.od.shape[0])}
+        entry = trial.names() | {"n": int(trial.od.shape[0])}
         for metric in METRICS:
             value = Spread(_total(trial, metric))
             entry |= {f"{metric}_mean": value.mean, f"{metric}_sd": value.sd, f"{metric}_ci95": value.ci95}
@@ -195,7 +139,7 @@ def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
 
 def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, theirs: Array) -> dict[str, Any]:
     found, mean = Spread(mine - theirs), Spread(theirs).mean
-    return _names(one) | {
+    return one.names() | {
         "against": other.cell.controller,
         "window": window,
         "metric": metric,
@@ -212,13 +156,8 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
 
 def _partners(trials: Sequence[T], against: str) -> list[tuple[T, T]]:
     """Every trial with that of `against` on the same vials."""
-
-    def vials(trial: Trial) -> tuple[object, ...]:
-        cell = trial.cell
-        return cell.signal, cell.plant, cell.scenario, cell.density, cell.calibrated
-
-    of = {vials(t): t for t in trials if t.cell.controller == against}
-    return [(t, of[vials(t)]) for t in trials if t.cell.controller != against and vials(t) in of]
+    of = {t.cell.vials: t for t in trials if t.cell.controller == against}
+    return [(t, of[t.cell.vials]) for t in trials if t.cell.controller != against and t.cell.vials in of]
 
 
 Scored = list[tuple[str, str, Array]]
@@ -232,9 +171,8 @@ def _density_scores(trial: DensityTrial) -> Scored:
 
 SCORES: dict[str, Callable[[Any], Scored]] = {
     "density": _density_scores,
-    "share": lambda trial: [("all", "ratio_abs_error", abs_error(trial))],
 }
-"""Signal -> what laws are compared by, reactor by reactor."""
+"""Signal -> what laws are compared by, reactor by reactor; a guest adds its own."""
 
 
 def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:

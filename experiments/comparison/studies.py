@@ -1,6 +1,6 @@
 """What a benchmark draws and counts: its closed loops, the calibration, the figures of its studies, summary.json."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +11,10 @@ from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
 from experiments.comparison import figures, statistics
 from experiments.comparison.config import SETTLING_MIN, TABLE_2, BenchmarkConfig
-from experiments.comparison.trials import DensityTrial, ShareTrial, Trial
+from experiments.comparison.trials import DensityTrial, Trial
 from experiments.reporting.calibration_charts import fit_figure
 
-__all__ = ["Drawing", "calibration", "draw", "summarise"]
+__all__ = ["AGAINST", "DRAWN", "Drawing", "calibration", "draw", "summarise"]
 
 CAPTIONS = {
     "regulation": "Regulation at 0.5 (the paper's Fig. 2c)",
@@ -22,9 +22,10 @@ CAPTIONS = {
     "temperature_switch": "37 to 30 °C (the paper's Fig. 3c)",
     "comparison": "Controllers side by side at 0.5 (the paper's Fig. 4)",
 }
-SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
-AGAINST = {"density": ("dqn", "dqn_adaptive", "oracle"), "share": ("pi",)}
-"""Signal -> the laws that the others are compared with, replicate by replicate."""
+AGAINST: dict[str, tuple[str, ...]] = {"density": ("dqn", "dqn_adaptive", "oracle")}
+"""Signal -> the laws that the others are compared with, replicate by replicate; a guest adds its own."""
+DRAWN: dict[str, Callable[[Sequence[Any], Sequence[dict[str, Any]]], Iterator["Drawing"]]] = {}
+"""Signal of a guest -> what draws its trials, by their rows, too."""
 
 
 class Drawing(NamedTuple):
@@ -64,7 +65,8 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
 
 def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
     """Draw the figures of the studies, from the trials and from the numbers of `summarise`."""
-    yield from _shares([t for t in trials if isinstance(t, ShareTrial)], summary["rows"])
+    for signal, drawn in DRAWN.items():
+        yield from drawn([t for t in trials if t.cell.signal == signal], summary["rows"])
     yield from _closed_loops(config, [t for t in trials if isinstance(t, DensityTrial)])
     if {"setpoint_steps", "temperature_switch"} & set(config.studies):
         yield Drawing(
@@ -99,38 +101,18 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             )
 
 
-def _shares(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iterator[Drawing]:
-    """Two figures of every scenario in which a share is held: every law and plant; the shares on the first plant."""
-    for scenario in dict.fromkeys(t.cell.scenario for t in trials):
-        here = [t for t in trials if t.cell.scenario == scenario]
-        plant = here[0].cell.plant
-        first = [t for t in here if t.cell.plant == plant]
-        if len(first) > len(SHOWN):
-            first = [t for t in first if t.cell.controller in SHOWN]
-        yield Drawing(
-            f"composition_{scenario}_laws",
-            figures.share_errors([r for r in rows if (r["signal"], r["scenario"]) == ("share", scenario)]),
-            f"{scenario}: every law and plant",
-            "Mean and 95 % interval over the reactors.",
-        )
-        yield Drawing(
-            f"composition_{scenario}_shares",
-            figures.shares(first),
-            f"{scenario}: shares on {plant}",
-            "Line: median over the reactors; band: the middle 90 %; dashed: setpoint.",
-        )
-
-
 def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> Iterator[Drawing]:
     """OD and pump rate of every study that is the paper's, or holds a single scenario and plant."""
     by_cell = {(t.cell.controller, t.cell.plant, t.cell.scenario): t for t in trials}
     for name, study in config.studies.items():
         several = len(study.plants) * len(study.scenarios) > 1
-        if study.compositions or not study.controllers or (several and name not in CAPTIONS):
+        if not study.controllers or (several and name not in CAPTIONS):
             continue
         for scenario in study.scenarios:
             for plant in study.plants:
-                shown = [by_cell[c, plant, scenario] for c in study.controllers][:4]
+                shown = [by_cell[c, plant, scenario] for c in study.controllers if (c, plant, scenario) in by_cell][:4]
+                if not shown:
+                    continue
                 long = config.scenarios[scenario].total_min > figures.LONG_MIN
                 what = "noise-free OD and pump rate in blocks of 10 min" if long else "measured OD and pump rate"
                 yield Drawing(

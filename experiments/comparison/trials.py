@@ -1,7 +1,7 @@
 """Closed loops to compare: one is a law on a plant in a scenario, all replicates as a single batch.
 
-A loop has a signal: what the law holds on its setpoint, the `density` by the pump or the `share` of the second species
-by the temperature. `Loops` runs those that the studies of a benchmark need, in processes of their own.
+A loop has a signal: what the law holds on its setpoint, the `density` by the pump or what a guest brings. `Loops` runs
+those that the studies of a benchmark need, in processes of their own.
 """
 
 from __future__ import annotations
@@ -13,66 +13,57 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from types import TracebackType
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from conf import guests
 from dqn.policy import Policy
 from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.cli.calibrated import read_pair
 from experiments.cli.stop import Workers
-from experiments.comparison.config import BenchmarkConfig
-from experiments.control.policies import load_policy
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.laws import registry
 from experiments.laws.base import Controller
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.recall import Recall
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import WindowMetrics, window_metrics
-from experiments.loop.share import TRUE, Share, program_of
 from experiments.loop.signals import Signal, within_2sd
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
 __all__ = [
-    "RUNS", "Cell", "DensityTrial", "Followed", "Loops", "ShareTrial", "Trial", "Window", "calibrate",
-    "cells", "run_cell", "run_trial", "windows",
+    "RUNS", "SPLITS", "Cell", "DensityTrial", "Followed", "Loops", "Trial", "Window", "cells", "closed", "record",
+    "run_cell", "run_trial", "windows",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-FACTOR_SD, OFFSET_SD = 0.02, 5.0
-"""Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
 SUPERVISED = ("supervised", "alarm")
-SHOWN = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
-"""Fields of a `ShareTrial` and the columns of a recording that they are."""
 LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
 
 
-class Cell(NamedTuple):
-    """What is run once: names of the law that is compared, plant and scenario, and of the signal that it holds.
-
-    Of a share: density, the controller that holds the OD beside it; announced: its changes are told ahead, as the
-    scenario has it; calibrated: the light sensor was, with its errors.
-    """
+@dataclass(frozen=True)
+class Cell:
+    """What is run once: names of the law that is compared, plant and scenario, and of the signal that it holds."""
 
     controller: str
     plant: str
     scenario: str
     signal: str = "density"
-    density: str = ""
-    announced: bool = False
-    calibrated: bool = False
+
+    @property
+    def vials(self) -> tuple[object, ...]:
+        """What loops that meet the same draws have in common."""
+        return self.signal, self.plant, self.scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +74,10 @@ class Trial:
     schedule: Scenario
     minute: Array
     temperature: Array
+
+    def names(self) -> dict[str, Any]:
+        """Say in a row of summary.json what was run."""
+        return {key: getattr(self.cell, key) for key in ("signal", "controller", "plant", "scenario")}
 
 
 @dataclass(frozen=True)
@@ -148,24 +143,7 @@ class DensityTrial(Trial):
         return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, inside], axis=1)).mean(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class ShareTrial(Trial):
-    """A share that was held, minute by minute; arrays (N, K).
-
-    foresight: the law knew of changes ahead. setpoint: (K,), nan where no share is asked for. share, od: true ones.
-    estimate, low, high: of the share and its 95 % band.
-    """
-
-    foresight: bool
-    setpoint: Array
-    share: Array
-    estimate: Array
-    low: Array
-    high: Array
-    od: Array
-
-
-def _closed(
+def closed(
     plant_config: PlantConfig,
     schedule: Scenario,
     model: EnvConfig,
@@ -191,11 +169,11 @@ def _closed(
     loop = ClosedLoop(
         reactors, controller, Interlock(replicates, safety, bench), schedule, further=further, model=model
     )
-    loop.density.known(plant, reactors.config.pump_ml_s, bench)
+    loop.known(plant, reactors.config.pump_ml_s)
     return loop, plant
 
 
-def _record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
+def record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
     """Run a loop to its end; return the minutes of its schedule, (K,), and what is seen at each, (N, K) by name."""
     schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
     minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
@@ -221,7 +199,7 @@ def run_trial(
 
     Args: cell: what it is called. make: builds the controller for a plant. The others: of `_closed`.
     """
-    loop, plant = _closed(
+    loop, plant = closed(
         plant_config, schedule, model, replicates, seed, lambda vials, _: (make(vials), (), SafetyConfig())
     )
 
@@ -237,7 +215,7 @@ def run_trial(
             "held": (step.response >= Response.HOLD).astype(np.float64),
         }
 
-    minute, stored = _record(loop, seen)
+    minute, stored = record(loop, seen)
     fields = {key: stored.pop(key) for key in ("od", "clean", "rate", "temperature", "media_ml")}
     held = np.nansum(stored.pop("held"), axis=1)
     told = {}
@@ -247,6 +225,11 @@ def run_trial(
     return DensityTrial(cell, schedule, minute, **fields, held=held, overflowed=plant.vessel.overflowed, told=told)
 
 
+Split = Callable[[StudyConfig, Cell], Sequence[Cell]]
+SPLITS: list[Split] = []
+"""Of a study, and a cell of it that holds a density, the cells that are run in its place; a guest adds its own."""
+
+
 def cells(config: BenchmarkConfig) -> list[Cell]:
     """Every closed loop that some study needs, once, in the order in which they are asked for."""
     wanted: dict[Cell, None] = {}
@@ -254,11 +237,9 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
         for scenario in study.scenarios:
             for plant in study.plants:
                 for controller in study.controllers:
-                    if not study.compositions:
-                        wanted[Cell(controller, plant, scenario)] = None
-                    for law in study.compositions:
-                        cell = Cell(law, plant, scenario, "share", controller, study.announced, study.calibrated)
-                        wanted[cell] = None
+                    cell = Cell(controller, plant, scenario)
+                    others = [other for split in SPLITS for other in split(study, cell)]
+                    wanted |= dict.fromkeys(others or [cell])
     return list(wanted)
 
 
@@ -275,58 +256,14 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
     return run_trial(cell, plant, schedule, lambda vials: law(plant=vials), config.env, config.replicates, config.seed)
 
 
-def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
-    """Run a trial in which a law holds the share, and a controller the density beside it."""
-    composition, policy = config.compositions[cell.controller], followed[0] if followed else None
-    scenario, pair = config.scenarios[cell.scenario], read_pair(config.pair)
-    schedule = scenario if cell.announced else replace(scenario, announce_min=0.0)
-    program, (coldest, warmest) = program_of(scenario), pair.temperatures
-
-    def make(plant: Plant, bench: Bench) -> tuple[Controller, Sequence[Signal], SafetyConfig]:
-        law = registry.build(composition, registry.SHARE, policy=policy, program=program, pair=pair)
-        estimator = CompositionEstimator(composition.estimator, np.full(plant.n, bench.volume_ml), pair)
-        share = Share(Recall(estimator), law, [schedule] * plant.n, simulated=True)
-        share.truth = lambda: plant.culture.share
-        if cell.calibrated:
-            calibrate(estimator, plant, config.seed)
-        safety = SafetyConfig(composition_low=coldest, composition_high=warmest)
-        return _beside(config, cell.density), (share,), safety
-
-    plant_config = config.plants[cell.plant]
-    loop, plant = _closed(plant_config, schedule, config.env, config.replicates, config.seed, make)
-
-    def seen(step: Step) -> dict[str, Array]:
-        columns = {key: step.columns[column] for key, column in SHOWN.items()}
-        return columns | {"temperature": step.temperature, "od": plant.culture.od}
-
-    minute, found = _record(loop, seen)
-    foresight = cell.announced and composition.kind in registry.FORESIGHT
-    return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
-
-
-def _beside(config: BenchmarkConfig, name: str) -> Controller:
-    """Build the controller of the density beside a share. Raises: UserError for a policy that does not fit."""
-    kind, policy = config.controllers[name].kind, None
-    if kind == "dqn":
-        policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)
-    density: Controller = registry.build(config.controllers[name], model=config.env, policy=policy)
-    return density
-
-
-def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
-    """Tell the estimator each reactor's factor and offset, with the errors that a calibration leaves."""
-    rng = np.random.default_rng([seed, 1])
-    factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
-    offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
-    estimator.calibrate(factor, FACTOR_SD * factor, offset, OFFSET_SD)
-
-
-RUNS: dict[str, Callable[[BenchmarkConfig, Cell, Followed | None], Trial]] = {"density": _density, "share": _share}
-"""Signal -> what runs one of its loops."""
+Run = Callable[[BenchmarkConfig, Any, Followed | None], Trial]
+RUNS: dict[str, Run] = {"density": _density}
+"""Signal -> what runs one of its loops; a guest adds its own."""
 
 
 def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
     """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    guests.load("experiments.comparison")
     return RUNS[cell.signal](config, cell, followed)
 
 
@@ -364,7 +301,7 @@ class Loops:
         with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
             for k, (cell, trial) in enumerate(self._finished(), 1):
                 trials[cell] = trial
-                bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
+                bar.set_postfix_str(f"{cell.controller} on {cell.plant}")
                 bar.update()
                 if bar.disable and (k % max(total // 10, 1) == 0 or k == total):
                     log.info("closed loop %d of %d: %s, %s, %s", k, total, cell.scenario, cell.plant, cell.controller)

@@ -6,40 +6,33 @@ A rehearsal is assembled here too, with a clock and a transport of its own.
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml  # type: ignore[import-untyped]
 
-from conf import presets
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
 from envs.bench import Bench
-from envs.coculture.pair import FILE, PairConfig
-from envs.plant.plant import PlantConfig, of_pair
+from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
-from experiments.cli import files, frame
-from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
+from experiments.cli import frame
+from experiments.cli.calibrated import read_env_file, read_plant_file
 from experiments.cli.files import choices
 from experiments.control import messages
 from experiments.control.config import DeployConfig
-from experiments.control.policies import WantedPolicy, admit, composition_policy, policy_check, run_policy
+from experiments.control.guests import GUESTS
+from experiments.control.policies import WantedPolicy, admit, policy_check, run_policy
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.program import Program
-from experiments.laws.share.recall import Recall
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.progress import Progress
-from experiments.loop.share import LightSignal, Share, program_of
 from experiments.loop.signals import AIM, Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop, is_over
@@ -48,13 +41,14 @@ from hardware.family import Family, Opening, family_of, report
 from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
-from hardware.storage import atomic
+from hardware.watch.opened import WatchedFamily
+from hardware.watched import WatchedInterlock
 
-__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack", "with_pair"]
+__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
 
 log = logging.getLogger(__name__)
 
-COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # presets
+USUAL_VIALS = "nominal_noise"  # preset
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +62,6 @@ class Setup:
     law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
     policy: as read, None for a preflight. bounds: of its certificate.
     further: signals that are held beside the density, which have seen nothing yet.
-    species: of two the second one, whose share may be held.
     fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
     resumed: an earlier life of the run is continued.
     """
@@ -87,7 +80,6 @@ class Setup:
     policy: Policy | None
     bounds: EstimateBounds | None
     further: list[Signal]
-    species: str
     fsync: bool
     title: str
     row: dict[str, float | str]
@@ -100,79 +92,13 @@ class Setup:
         return (*COLUMNS, *aim, *(column for signal in self.further for column in signal.columns))
 
 
-def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
-    """Keep a copy of two species from a file, `pair.yaml`, by which the run goes, also when it is resumed."""
-    kept, given = folder / FILE, read_pair(config.pair) if config.resume is None else None
-    if given is not None and config.pair not in presets.groups()["strains"]:
-        text = yaml.safe_dump(files.plain(asdict(given)), sort_keys=False, allow_unicode=True)
-        atomic.write(kept, f"# The two species of this run, from {config.pair}.\n{text}")
-    return replace(config, pair=str(kept)) if kept.is_file() else config
-
-
-def completed(config: DeployConfig) -> DeployConfig:
-    """Fill in the composition controller and the vials where a scenario asks for a composition.
-
-    All simulated vials get the two species of the run. Raises: UserError for a schedule that is not allowed.
-    """
-    with frame.refusing(ValueError):
-        composed = any(s.composed for s in config.schedules())
-    pair = read_pair(config.pair)
-    if composed:
-        config = _composed(config, pair)
-    if family_of(config.backend).simulated and config.plant.pair == PairConfig():  # another one differs on purpose
-        config = replace(config, plant=of_pair(config.plant, pair))
+def completed(config: DeployConfig, folder: Path | None = None) -> DeployConfig:
+    """Fill in what guests complete. Args: as of `Guest.completed`. Raises: UserError."""
+    with frame.refusing(ValueError, ReactorError):
+        config.schedules()
+        for guest in GUESTS:
+            config = guest.completed(config, folder)
     return config
-
-
-def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
-    config, backend, chosen = _rested(config, pair), config.backend, []
-    if config.composition is None:
-        law = build(registry.config(COMPOSITION, registry.SHARE), load(f"composition/{COMPOSITION}"), "composition")
-        config = replace(config, composition=law)
-        chosen.append(f"composition={COMPOSITION}")
-    if (two := family_of(backend).coculture(backend, config.pair)) != backend:
-        config = replace(config, backend=two)
-        chosen.append(f"backend.plant={two.plant} backend.pair={two.pair}")
-    usual = build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
-    if family_of(backend).simulated and config.plant == usual and not (config.plant_file or config.env_file):
-        config = replace(config, plant=build(PlantConfig(), load(f"plant/{VIALS}"), "plant"))
-        chosen.append(f"plant={VIALS}")
-    config = replace(config, safety=_within(config.safety, pair))
-    if chosen:
-        log.info("the scenario asks for a share: %s", " ".join(chosen))
-    species, (low, high) = f"{pair.first.name} and {pair.second.name}", pair.temperatures
-    log.info("%s, %g to %g degC; both grow alike at %.2f degC", species, low, high, pair.even_c)
-    return config
-
-
-def _rested(config: DeployConfig, pair: PairConfig) -> DeployConfig:
-    """Every phase without a temperature gets that at which both grow alike."""
-    each = {
-        name: own | {"temperatures": [pair.resting_c if t is None else t for t in own["temperatures"]]}
-        if isinstance(own, dict) and isinstance(own.get("temperatures"), list)
-        else own
-        for name, own in config.each.items()
-    }
-    return replace(config, scenario=config.scenario.resting(pair.resting_c), each=each)
-
-
-def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
-    """Limits of the thermostat's target: those of the pair where nothing else is asked for. Raises: UserError."""
-    usual, given = SafetyConfig(), (safety.composition_low, safety.composition_high)
-    low, high = (
-        end if asked == left else asked
-        for asked, left, end in zip(
-            given, (usual.composition_low, usual.composition_high), pair.temperatures, strict=True
-        )
-    )
-    if not low < pair.even_c < high:
-        allowed = (
-            f"a range that holds {pair.even_c:.2f} degC, where {pair.first.name} and {pair.second.name} grow alike"
-        )
-        raise frame.UserError(
-            f"safety.composition_low to composition_high = {low:g} to {high:g} degC: allowed {allowed}"
-        )
-    return replace(safety, composition_low=low, composition_high=high)
 
 
 def unpack(config: DeployConfig, folder: Path) -> Setup:
@@ -181,6 +107,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     Raises: UserError naming what cannot be read or does not fit.
     """
     family, backend, safety = family_of(config.backend), config.backend, config.safety
+    if config.watch:
+        family = WatchedFamily(family)
     resumed = config.resume is not None
     with frame.refusing(ValueError):
         scenarios, ends = config.schedules(), config.ends()
@@ -214,7 +142,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
-        policy, bounds, further, read_pair(config.pair).second.name, config.fsync, *_named(config, family, folder),
+        policy, bounds, further, config.fsync, *_named(config, family, folder),
         resumed,
     )  # fmt: skip
 
@@ -267,27 +195,25 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
     chosen, decides, controlled = choices(folder), str(config.controller.kind), str(config.backend.kind)
     if family.simulated:
         controlled = "plant_file" if config.plant_file else chosen.get("plant", "given")
-        if config.composition is not None and controlled == USUAL_VIALS:  # replaced by `completed`
-            controlled = VIALS
-    law = "" if config.composition is None else f" and {config.composition.kind}"
+        if controlled == USUAL_VIALS:  # which may have been replaced
+            controlled = next(filter(None, (guest.vials(config) for guest in GUESTS)), controlled)
+    law = "".join(f" and {kind}" for guest in GUESTS for _, kind in guest.deciders(config))
     row: dict[str, float | str] = {"command": "deploy", "decides": decides, "on": controlled}
     row["scenario"] = chosen.get("scenario", "given")
     if family.simulated and not (config.plant_file or config.env_file):
         volume_ml = config.plant.vessel.volume_ml or config.bench.volume_ml
         tau = volume_ml / (60.0 * config.plant.pump.gain_ml_s)
         row |= {"seed": config.backend.seed, "mu": config.plant.growth.mu, "tau": tau}
-    return f"{decides}{law} on {controlled}", row
+    return f"{decides}{law} {'beside' if config.watch else 'on'} {controlled}", row
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
     """Build the signals held beside the density. Raises: UserError where scenario, backend and they do not fit."""
     with frame.refusing(ValueError, ReactorError):
-        share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
-        own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
-        vials = family_of(config.backend).vials(config.backend, plant)
-        lit = family_of(config.backend).sees_fluorescence(config.backend) or (vials and vials[1].second.present)
-        light = [LightSignal()] if lit and not share and not own else []
-        family, made = family_of(config.backend), [*share, *light, *own]
+        family, made = family_of(config.backend), []
+        for guest in GUESTS:
+            made += guest.signals(config, plant, folder, scenarios)
+        made += [signals.made(name, law, scenarios) for name, law in config.signals.items()]
         actuators = {actuator.name: actuator for actuator in family.actuators(config.backend)}
         signals.fitting(made, list(actuators.values()))
         for signal in made:
@@ -296,48 +222,6 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
                 raise messages.PumpTwice(key=key, pump=pump)
             family.gives(config.backend, config.bench, [{pump} - {0}] * len(scenarios), key)
         return made
-
-
-def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
-    """Build the signal of the share. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
-    asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if s.composed]
-    kind = config.composition.kind
-    if not asked:
-        remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
-        raise frame.UserError(f"composition={kind}: no scenario asks for a share; {remedy}")
-    vials = family_of(config.backend).vials(config.backend, plant)
-    if vials is not None and not vials[1].second.present:
-        key = f"{vials[0]}={VIALS}"
-        raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
-    one = next(s for s in scenarios if s.composed)
-    if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
-        raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
-    policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
-    program, volumes_ml = program_of(one), config.bench.volumes(config.backend.reactors)
-    pair = read_pair(config.pair)
-    law = registry.build(config.composition, registry.SHARE, policy=policy, program=program, pair=pair)
-    if policy is not None:
-        _check_shares(policy, kind, [program_of(s) for s in scenarios if s.composed], config.force_policy)
-    estimator = Recall(CompositionEstimator(config.composition.estimator, volumes_ml, pair))
-    simulated = family_of(config.backend).simulated
-    return Share(estimator, law, scenarios, config.share_warnings, simulated=simulated)
-
-
-def _check_shares(policy: Policy, kind: str, programs: list[Program], forced: bool) -> None:
-    """Whether a policy was trained for what is asked for; a share beyond that it holds at the end of its range.
-
-    Raises: UserError; forced: it is only said.
-    """
-    low, high = policy.metadata["model"]["setpoints"]
-    outside = sorted({s for p in programs for s in p.extremes if not low - 1e-9 <= s <= high + 1e-9})
-    if not outside:
-        return
-    what = f"composition={kind}: its policy was trained for shares of {low:g} to {high:g}, the scenario asks for "
-    what += ", ".join(f"{s:g}" for s in outside)
-    if not forced:
-        remedy = "give composition=midpoint, a policy trained with env.setpoints that reach there, or force_policy=true"
-        raise frame.UserError(f"{what}; {remedy}")
-    log.warning("%s; it runs all the same: force_policy=true", what)
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
@@ -353,10 +237,8 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
             volume_ml=volumes_ml,
         )  # fmt: skip
     rim_ml = setup.family.rim_ml(volumes_ml)
-    interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
-    for signal in setup.further:
-        if isinstance(signal, Share) and plant is not None:
-            signal.truth = partial(getattr, plant.culture, "share")
+    kind = WatchedInterlock if isinstance(setup.family, WatchedFamily) else Interlock
+    interlock = kind(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
     scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
     loop = ClosedLoop(
@@ -364,7 +246,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
         setup.family.actuators(setup.backend), setup.model,
     )  # fmt: skip
     if plant is not None:
-        loop.density.known(plant, flow, setup.bench)
+        loop.known(plant, flow)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path, record.rows)
     return loop

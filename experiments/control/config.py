@@ -10,7 +10,6 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
-from experiments.loop.share import ShareWarnings
 from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
@@ -54,24 +53,10 @@ class DeployConfig:
         above=0.0,
     )
     force_policy: bool = setting(False, "run a policy on a device without a certificate that it is safe for this run")
-    composition: Any = setting(
-        None,
-        "controller of the temperature if the scenario has a composition: a preset of `composition`; null: none",
-        kinds=registry.config_at,
-    )
-    composition_policy: str = setting(
-        "shipped",
-        "policy of composition=dqn and dqn_preview: `shipped`, a policy.npz, or the run folder of a training or "
-        "deployment",
-    )
-    share_warnings: ShareWarnings = part(ShareWarnings, "warnings of a composition out of control")
     signals: dict[str, Any] = setting(
         {},
         "further controlled signals, from extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE",
         kinds=registry.config_at,
-    )
-    pair: str = setting(
-        "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
     )
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: model of the simulated plant")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
@@ -83,11 +68,17 @@ class DeployConfig:
     fsync: bool = setting(True, "write every row to the disk before the next command")
     dry_run: bool = setting(False, "print the timetable and the parts of the run; contact no device, write nothing")
     preflight_only: bool = setting(False, "check the device and stop")
+    watch: bool = setting(
+        False,
+        "read, estimate, decide and warn beside whatever regulates the culture, and send no command; backend=chibio or "
+        "pioreactor",
+    )
     resume: str | None = setting(None, "a run folder to continue, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)
         self.safety.ages_s(self.bench)
+        require(not (self.watch and self.resume), "resume", self.resume, "null with watch=true, which begins anew")
         if family_of(self.backend).simulated:
             self.plant.vessel.of(self.bench.volumes(self.backend.reactors))
         unknown = [name for name in self.bench.volumes_ml if name not in self.backend.reactors]

@@ -19,25 +19,18 @@ from experiments.certification.certificate import Opinion
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
 from experiments.control import messages
-from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from hardware.family import Check
 from hardware.storage import atomic
 
 __all__ = [
-    "COMPOSITION_POLICY", "SHIPPED", "SHIPPED_COMPOSITION", "Training", "WantedPolicy", "admit", "composition_policy",
-    "find_policy", "load_policy", "policy_check", "run_policy",
+    "SHIPPED", "Training", "WantedPolicy", "admit", "find_policy", "keep", "load_policy", "policy_check", "readable",
+    "run_policy",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
 SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
-SHIPPED_COMPOSITION = {
-    "dqn": SHIPPED.with_name("coculture.npz"),
-    "dqn_preview": SHIPPED.with_name("coculture_preview.npz"),
-}
-"""The policy of each learned composition controller that comes with the program."""
-COMPOSITION_POLICY = "composition_policy.npz"  # in a run folder: the copy that all its reactors use
 TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
 FORCE = "force_policy=true runs it all the same"
 
@@ -136,7 +129,7 @@ def find_policy(name: str) -> Path:
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
+def readable(path: Path) -> Iterator[None]:
     """Read a policy in this context. Raises: UserError naming the file and what is wrong with it."""
     try:
         yield
@@ -154,7 +147,7 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     Raises: UserError naming the file and, for a mismatch, both values.
     """
     path = find_policy(name)
-    with _readable(path):
+    with readable(path):
         policy = policies.load(path)
         training = Training.of(policy)
         fastest = 0.0 if training.relative else float(policy.actions.max())
@@ -223,11 +216,11 @@ def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> Policy:
     source = kept if again else find_policy(wanted.name)
     policy = load_policy(str(source), wanted.bench.control_min, wanted.bench.max_rate)
     if not again:
-        _keep(policy, kept, certificate.beside(source))
+        keep(policy, kept, certificate.beside(source))
     return policy
 
 
-def _keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
+def keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
     """Write the copy of a policy, and of its certificate `proof` where there is one. Raises: UserError."""
     try:
         policies.save(kept, policy)
@@ -235,30 +228,3 @@ def _keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
             atomic.write(certificate.beside(kept), proof.read_text(encoding="utf-8"), fsync=False)
     except OSError as error:
         raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
-
-
-def _share_policy(name: str) -> Path:
-    """Return the path as `find_policy`; for the folder of a deployment, that of its composition policy."""
-    run = Path(name)
-    return run / COMPOSITION_POLICY if (run / "journal.jsonl").is_file() else find_policy(name)
-
-
-def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:
-    """Load the policy of a composition controller, None for one without; the run folder keeps a copy.
-
-    Args: kind: of the controller. name: `shipped`, a policy.npz or a run folder.
-    Raises: UserError naming the file and what is wrong with it.
-    """
-    if not registry.takes(kind, "policy", registry.SHARE):
-        return None
-    kept = folder / COMPOSITION_POLICY
-    again = resumed and kept.is_file()
-    path = SHIPPED_COMPOSITION.get(kind, Path("shipped")) if name == "shipped" or again else _share_policy(name)
-    if not again and name == "shipped" and not path.is_file():
-        remedy = "give composition_policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
-        raise frame.UserError(f"composition={kind}: no policy for it comes with this version; {remedy}")
-    with _readable(path):
-        policy = policies.load(kept if again else path)
-    if not again:
-        _keep(policy, kept)
-    return policy

@@ -17,21 +17,22 @@ from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
+from experiments.loop.signals import Draws
 from experiments.record.messages import AlarmsTold
 from experiments.record.record import Record
 from experiments.record.summary import (
     ChangeLog,
-    composition_figure_of,
     figure_of,
     metrics_table,
     reasons_line,
-    shares_table,
+    signals_table,
     summarise,
 )
 from experiments.reporting import charts
 from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError
 from hardware.storage.marks import NAME, Mark, read_marks
+from hardware.watched import Watched
 
 __all__ = ["BenchMarks", "deploy"]
 
@@ -77,11 +78,14 @@ class BenchMarks:
                 loop.refilled(mark.reactor, mark.bottle_ml)
                 log.info(messages.BottleMarked(reactor=mark.reactor, bottle_ml=mark.bottle_ml))
         if mark.share is not None and mark.sd is not None:
-            counted = {"share": mark.share, "sd": mark.sd, "minute": mark.time_min}
-            journal.append("share", {"reactor": mark.reactor, **counted})
+            counted = mark.share, mark.sd, mark.time_min
+            journal.append(
+                "share", {"reactor": mark.reactor, **dict(zip(("share", "sd", "minute"), counted, strict=True))}
+            )
             if known:
-                answer, doubtful = loop.counted(mark.reactor, **counted)
-                told = messages.ShareMarked(reactor=mark.reactor, answer=answer, **counted)
+                answer, doubtful = loop.counted(mark.reactor, *counted)
+                share, sd, minute = counted
+                told = messages.ShareMarked(reactor=mark.reactor, answer=answer, share=share, sd=sd, minute=minute)
                 log.log(logging.WARNING if doubtful else logging.INFO, told)
 
 
@@ -111,7 +115,10 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
         try:
             reactors.stop()
             left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
-            log.info(messages.PumpsOff(left=f"; {left}: left to the on-board regulation" if left else ""))
+            if isinstance(reactors, Watched):
+                log.info(messages.OnlyWatched())
+            else:
+                log.info(messages.PumpsOff(left=f"; {left}: left to the on-board regulation" if left else ""))
         except ReactorError as error:
             outcome = f"failed: {error}"
     return outcome
@@ -128,8 +135,8 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         title = f"{setup.title}: {outcome}"
         table = record.table()
         figures = {"closed_loop": figure_of(table, setup.scenarios, title)}
-        if "ratio" in table.columns:
-            figures["composition"] = composition_figure_of(table, setup.scenarios, setup.species, title)
+        for signal in setup.further:
+            figures |= signal.figures(table, title) if isinstance(signal, Draws) else {}
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {
             **summarise(table, setup.scenarios, setup.roles, outcome, loop.progress),
@@ -145,8 +152,8 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
             log.warning(AlarmsTold(reactor=name, kinds=line))
     what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
-    if shares := shares_table(summary["windows"]):
-        log.info("share of the second species, estimated unless it says true\n%s", shares)
+    if signals := signals_table(summary["windows"]):
+        log.info("beside the density, estimated unless it says true\n%s", signals)
     log.info("recordings %s; figure %s", folder / "recordings", summary["figure"])
     log.info("next, all of it on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
     return outcome
@@ -155,7 +162,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
     outlet.detach()
-    if (whole := assemble.completed(assemble.with_pair(config, folder))) != config:
+    if (whole := assemble.completed(config, folder)) != config:
         config = whole
         frame.save_config(config, folder)
     setup = assemble.unpack(config, folder)

@@ -14,6 +14,7 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
+from experiments.control.guests import GUESTS
 from hardware.errors import ReactorError
 
 __all__ = ["Expected", "expected", "timetable"]
@@ -93,9 +94,9 @@ def _deciders(c: DeployConfig, setup: Setup) -> str:
     policy = ""
     if setup.policy is not None:
         policy = f", policy {c.policy} (regret {float(setup.policy.metadata.get('regret_pct', math.nan)):.2g} %)"
-    share = "" if c.composition is None else f"; share: {c.composition.kind}"
+    further = "".join(f"; {what}: {kind}" for guest in GUESTS for what, kind in guest.deciders(c))
     own = "".join(f"; {name}: {law.kind}" for name, law in c.signals.items())
-    return f"controller {c.controller.kind}{policy}{share}{own}; at_end {c.at_end}"
+    return f"controller {c.controller.kind}{policy}{further}{own}; at_end {c.at_end}"
 
 
 def _device(setup: Setup) -> Iterator[str]:
@@ -123,8 +124,7 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
     ):
         step = expected(scenario, k, od, growth, dilution, volume_ml)
         until = (scenario.until[k] if scenario.until else None) or "its time"
-        share = scenario.ratios[k] if scenario.ratios else None
-        said = f"{until}{'' if share is None else f'; share {share:g}, which decides the temperature'}"
+        said = "; ".join([until, *filter(None, (guest.asked(scenario, k) for guest in GUESTS))])
         yield (
             f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {most_min:8.0f} "
             f"{setpoint:6.2f} {degc:6.1f} {step.ml:7.1f}  {said}"

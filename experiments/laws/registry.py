@@ -1,18 +1,12 @@
 """Every law of every signal: its config, what makes it, and what it is made from."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from conf import presets
 from conf.messages import NotAllowed
-from dqn.policy import Policy
 from envs.bench import Bench
-from envs.coculture.pair import PairConfig
-from envs.plant.plant import Plant
-from envs.task import EnvConfig
-from experiments.certification.bounds import EstimateBounds
-from experiments.laws.base import Array
 from experiments.laws.density.baselines import (
     GainScheduled,
     GainScheduledConfig,
@@ -26,38 +20,10 @@ from experiments.laws.density.learned import LearnedConfig, learned
 from experiments.laws.density.mpc import Mpc, MpcConfig
 from experiments.laws.density.oracle import Oracle, OracleConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
-from experiments.laws.share.laws import (
-    PI,
-    BangBang,
-    BangBangConfig,
-    InverseDynamics,
-    InverseDynamicsConfig,
-    Midpoint,
-    MidpointConfig,
-    Myopic,
-    MyopicConfig,
-    PIConfig,
-    Proportional,
-    ProportionalConfig,
-)  # fmt: skip
-from experiments.laws.share.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
-from experiments.laws.share.planned import Optimum, OptimumConfig, Receding, RecedingConfig
-from experiments.laws.share.program import Program
 
-__all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "LawKind", "add", "build", "config", "on_device", "takes"]
+__all__ = ["DENSITY", "KINDS", "LawKind", "Laws", "Part", "add", "build", "config", "hold", "on_device", "takes"]
 
-DENSITY, SHARE = "density", "share"
-GROUPS = {DENSITY: "controller", SHARE: "composition"}  # of presets, and key of the config
-PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "program", "volume_ml", "pair")
-MISSING = {
-    (DENSITY, "policy"): "needs a policy; give policy=RUN/policy.npz",
-    (DENSITY, "plant"): "knows a simulated plant; allowed with backend=sim only",
-    (SHARE, "policy"): "needs a policy; give policy=RUN/policy.npz of a training with env=coculture or "
-    "env=coculture_preview",
-    (SHARE, "program"): "plans the whole program; give a scenario with ratios",
-}
-FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")
-"""Laws of the share that act on what is announced."""
+DENSITY = "density"
 
 
 @dataclass(frozen=True)
@@ -69,62 +35,89 @@ class LawKind:
     parts: tuple[str, ...] = ()
 
 
-KINDS: dict[str, dict[str, LawKind]] = {
-    DENSITY: {
-        "dqn": LawKind(LearnedConfig, learned, ("policy", "model", "bounds")),
-        "pi": LawKind(ChiBioPIConfig, ChiBioPI, ("volume_ml",)),
-        "pi_tuned": LawKind(TunedPIConfig, TunedPI, ("model",)),
-        "mpc": LawKind(MpcConfig, Mpc, ("model",)),
-        "inverse": LawKind(InverseConfig, Inverse, ("model",)),
-        "threshold": LawKind(ThresholdConfig, Threshold),
-        "gain_scheduled": LawKind(GainScheduledConfig, GainScheduled, ("model",)),
-        "hold": LawKind(HoldConfig, Hold, ("model",)),
-        "oracle": LawKind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
-    },
-    SHARE: {
-        "dqn": LawKind(LearnedLawConfig, LearnedLaw, ("policy", "pair")),
-        "dqn_preview": LawKind(PreviewLawConfig, LearnedLaw, ("policy", "pair")),
-        "pi": LawKind(PIConfig, PI, ("pair",)),
-        "proportional": LawKind(ProportionalConfig, Proportional, ("pair",)),
-        "inverse_dynamics": LawKind(InverseDynamicsConfig, InverseDynamics, ("pair",)),
-        "bang_bang": LawKind(BangBangConfig, BangBang, ("pair",)),
-        "myopic": LawKind(MyopicConfig, Myopic, ("pair",)),
-        "midpoint": LawKind(MidpointConfig, Midpoint, ("pair",)),
-        "receding": LawKind(RecedingConfig, Receding, ("pair",)),
-        "optimum": LawKind(OptimumConfig, Optimum, ("program", "pair")),
-    },
+@dataclass(frozen=True)
+class Part:
+    """What a law may be made from, where it is not given: its value, and what is said where it cannot be None."""
+
+    usual: Any = None
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Laws:
+    """What the laws of a signal have in common.
+
+    key: where a law is said in a config, and group of its presets; "": below `signals`, without any. parts: by name.
+    kinds: the laws, by name.
+    """
+
+    key: str = ""
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    kinds: dict[str, LawKind] = field(default_factory=dict)
+
+
+SIGNALS = {
+    DENSITY: Laws(
+        "controller",
+        {
+            "model": Part(),  # growth, control period and largest pump rate, as calibrated
+            "policy": Part(missing="needs a policy; give policy=RUN/policy.npz"),
+            "plant": Part(missing="knows a simulated plant; allowed with backend=sim only"),
+            "bounds": Part(),  # within which the policy's certificate lets it act; None: nobody supervises
+            "flow_ml_s": Part(1.0),  # what the backend believes its pumps deliver, by which the oracle doses
+            "volume_ml": Part(Bench.volume_ml),  # of the cultures, (N,) or one for all
+        },
+        {
+            "dqn": LawKind(LearnedConfig, learned, ("policy", "model", "bounds")),
+            "pi": LawKind(ChiBioPIConfig, ChiBioPI, ("volume_ml",)),
+            "pi_tuned": LawKind(TunedPIConfig, TunedPI, ("model",)),
+            "mpc": LawKind(MpcConfig, Mpc, ("model",)),
+            "inverse": LawKind(InverseConfig, Inverse, ("model",)),
+            "threshold": LawKind(ThresholdConfig, Threshold),
+            "gain_scheduled": LawKind(GainScheduledConfig, GainScheduled, ("model",)),
+            "hold": LawKind(HoldConfig, Hold, ("model",)),
+            "oracle": LawKind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
+        },
+    )
 }
+KINDS = SIGNALS[DENSITY].kinds
+"""The laws of the density."""
+
+
+def hold(signal: str, key: str, parts: Mapping[str, Part]) -> None:
+    """Make a signal known whose laws are said at a key of their own, with presets of that group. Args: of `Laws`."""
+    SIGNALS[signal] = Laws(key, parts)
 
 
 def add(
     kind: str, config: type[Any], make: Callable[..., Any], what: str, parts: Sequence[str] = (), signal: str = DENSITY
 ) -> None:
-    """Make a law known: `controller=KIND` of the density, `composition=KIND` of the share, `signals.NAME.kind=KIND`.
+    """Make a law known: `controller=KIND` of the density, `signals.NAME.kind=KIND` of another signal.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`; one of the share also has the
-        field `estimator` of `experiments.laws.share.laws.LawConfig`.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
       make: called with the config and then the `parts`, returns the law.
-      what: the sentence that the help shows.
-      parts: what else it is made from, arguments of `build`.
-      signal: which it holds: density, share, or one of one's own (`experiments.loop.signals.add`).
+      what: the sentence that the help shows; "": it has a preset of conf/, whose words are shown.
+      parts: what else it is made from, of those that the signal has.
+      signal: which it holds: density, or one of one's own (`experiments.loop.signals.add`).
     Raises: ValueError for a kind that exists, or a part that nobody has.
     """
-    if wrong := set(parts) - set(PARTS):
-        raise ValueError(f"{signal}, law {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(PARTS)}")
-    if signal in GROUPS:
-        presets.add(f"{GROUPS[signal]}/{kind}", {"kind": kind}, what)
-    KINDS.setdefault(signal, {})[kind] = LawKind(config, make, tuple(parts))
+    held = SIGNALS.setdefault(signal, Laws())
+    if wrong := set(parts) - set(held.parts):
+        raise ValueError(f"{signal}, law {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(held.parts) or 'none'}")
+    if held.key and what:
+        presets.add(f"{held.key}/{kind}", {"kind": kind}, what)
+    held.kinds[kind] = LawKind(config, make, tuple(parts))
 
 
 def _kind(kind: str, signal: str) -> LawKind:
-    if kind not in KINDS.get(signal, {}):
-        key = f"{GROUPS.get(signal, f'signals.{signal}')}.kind"
-        missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(KINDS)}"
-        allowed = ", ".join(KINDS.get(signal, {})) or missing
-        raise NotAllowed(key=key, given=kind, allowed=allowed)
-    return KINDS[signal][kind]
+    held = SIGNALS.get(signal, Laws())
+    if kind not in held.kinds:
+        missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(SIGNALS)}"
+        key = f"{held.key or f'signals.{signal}'}.kind"
+        raise NotAllowed(key=key, given=kind, allowed=", ".join(held.kinds) or missing)
+    return held.kinds[kind]
 
 
 def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
@@ -134,7 +127,7 @@ def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
 
 def on_device(kind: str) -> str:
     """Return the law of the density, if it needs no simulated plant. Raises: ValueError naming those that do not."""
-    known = [name for name, law in KINDS[DENSITY].items() if "plant" not in law.parts]
+    known = [name for name, law in KINDS.items() if "plant" not in law.parts]
     if kind not in known:
         raise NotAllowed(key="controller_kind", given=kind, allowed=", ".join(known))
     return kind
@@ -146,44 +139,25 @@ def config(kind: str, signal: str = DENSITY) -> Any:
 
 
 def config_at(kind: str, key: str) -> Any:
-    """Return the default config of a law by where it stands: controller, compositions.NAME, signals.NAME.
+    """Return the default config of a law by where it stands: controller, controllers.NAME, signals.NAME.
 
     Raises: ValueError naming the laws there are.
     """
     group, _, name = key.partition(".")
-    groups = {word + s: signal for signal, word in GROUPS.items() for s in ("", "s")}
-    return config(kind, groups.get(group, name))
+    keys = {held.key + s: signal for signal, held in SIGNALS.items() for s in ("", "s") if held.key}
+    return config(kind, keys.get(group, name))
 
 
-def build(
-    config: Any,
-    signal: str = DENSITY,
-    *,
-    model: EnvConfig | None = None,
-    policy: Policy | None = None,
-    plant: Plant | None = None,
-    flow_ml_s: float = 1.0,
-    bounds: EstimateBounds | None = None,
-    program: Program | None = None,
-    volume_ml: Array | float = Bench.volume_ml,
-    pair: PairConfig | None = None,
-) -> Any:
-    """Build the law that a config describes, a `Controller` of the density or a `Law` of the share.
+def build(config: Any, signal: str = DENSITY, **given: Any) -> Any:
+    """Build the law that a config describes: of the density a `Controller`.
 
-    Args:
-      config: as `config` gives it; `kind` names the law.
-      model: the calibrated growth model, control period and largest pump rate.
-      policy: what a learned law follows. program: of shares, which `optimum` plans.
-      plant: the vials that `oracle` knows; only a simulation has it. flow_ml_s: what the backend believes its pumps
-        deliver (the oracle must know what a rate becomes).
-      bounds: within which the certificate of `policy` lets it act; None where it has none, and nobody supervises.
-      volume_ml: of the cultures, as the bench says, (N,) or one for all.
-      pair: the two species whose share a law holds; None: the default one.
+    Args: config: as `config` gives it; `kind` names the law. given: parts of the signal, by name.
     Raises: ValueError naming what is missing for this law.
     """
-    law = _kind(config.kind, signal)
-    given = dict(zip(PARTS, (model, policy, plant, bounds, flow_ml_s, program, volume_ml, pair), strict=True))
-    for part in law.parts:
-        if given[part] is None and (signal, part) in MISSING:
-            raise ValueError(f"{GROUPS[signal]} = {config.kind}: {MISSING[signal, part]}")
-    return law.make(config, **{part: given[part] for part in law.parts})
+    law, held, made = _kind(config.kind, signal), SIGNALS[signal], {}
+    for name in law.parts:
+        part = held.parts[name]
+        made[name] = given.get(name, part.usual)
+        if made[name] is None and part.missing:
+            raise ValueError(f"{held.key} = {config.kind}: {part.missing}")
+    return law.make(config, **made)

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.laws.base import Array, Controller, Estimates, Mask
 from experiments.laws.density.estimators import WithEstimator
 from experiments.loop.progress import Progress
-from experiments.loop.signals import AIM, Answer, Count, Counted, Density, Sample, Signal, fitting, shaped
+from experiments.loop.signals import AIM, Answer, Count, Counted, Density, Knows, Sample, Signal, fitting, shaped
 from experiments.loop.supply import Supply
 from hardware import memory
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
@@ -131,6 +132,12 @@ class ClosedLoop:
         self.repeated_ml = np.zeros(n)  # by the devices themselves, in no step yet
         self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
         controller.reset(n)
+
+    def known(self, plant: Plant, flow_ml_s: float) -> None:
+        """Tell the signals of simulated vials. Args: flow_ml_s: of a pump as the driver takes it."""
+        for signal in self.signals:
+            if isinstance(signal, Knows):
+                signal.known(plant, flow_ml_s, self.interlock.bench)
 
     def run(self) -> Iterator[Step]:
         """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
@@ -255,15 +262,15 @@ class ClosedLoop:
         """Go on with a bottle that was filled to so much."""
         self.interlock.refilled(self.reactors.names.index(name), bottle_ml)
 
-    def counted(self, name: str, share: float, sd: float, minute: float) -> Answer:
-        """Take a share counted in a sample of a reactor, drawn at a minute of the run; return what came of it."""
+    def counted(self, name: str, value: float, sd: float, minute: float) -> Answer:
+        """Take what was counted in a sample of a reactor, drawn at a minute of the run; return what came of it."""
         for signal in self.signals:
             if isinstance(signal, Counted):
-                return signal.counted(self.reactors.names.index(name), share, sd, minute)
+                return signal.counted(self.reactors.names.index(name), value, sd, minute)
         return "left out: nothing here estimates it", True
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count]) -> None:
-        """Replay recordings of the run's earlier lives, and counted shares, to every estimator that uses them."""
+        """Replay recordings of the run's earlier lives, and what was counted, to every estimator that uses them."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))

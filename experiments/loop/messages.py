@@ -5,8 +5,7 @@ from hardware.messages import Fault
 
 # fmt: off
 
-class FilterAlarm(Fault, response="report", says="readings do not fit the estimate",
-    remedy="the controller on a second filter decides"):
+class FilterAlarm(Fault, response="report", says="readings do not fit the estimate", remedy="{then}"):
     """A jump of the OD, bubbles, chance, or wrong settings; in rows and summary, not on the screen."""
 class SignalError(Message, ValueError):
     """A signal of the run does not fit; told at the start."""

@@ -1,7 +1,7 @@
 """What the loop holds: signals. Each has an estimate, a law that decides, an actuator, columns and warnings of its own.
 
-The density, held by the feed pump, is always one of them (`Density`). The share of two species, held by the thermostat,
-is another (`experiments/loop/share.py`). One of one's own is made known by `add` (docs/extending.md).
+The density, held by the feed pump, is always one of them (`Density`). Another is brought by a guest, or made known by
+`add` (docs/extending.md).
 """
 
 import math
@@ -29,7 +29,9 @@ __all__ = [
     "TRUE",
     "Counted",
     "Density",
+    "Draws",
     "Findings",
+    "Knows",
     "Sample",
     "Signal",
     "add",
@@ -44,7 +46,7 @@ ESTIMATED = ("error", "growth_share")
 MOST_PERIODS = 1e4  # for half of a transition that the estimate takes for impossible
 AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
 PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
-TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
+TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "journal_row")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ class Sample:
         """Build a sample: a measurement with what the interlock says of its light and of targets."""
         light, safety = interlock.fluorescence(m), interlock.config
         light = np.full(m.od.shape, np.nan) if light is None else light
-        limits = safety.composition_low, safety.composition_high
+        limits = safety.targets
         schedule = elapsed, phase, setpoint, temperature, limits, *(ahead or ())
         return cls(m, light, rows, believed, m.time_s / 60.0, *schedule)
 
@@ -140,18 +142,34 @@ class Signal(Protocol):
 
 
 Count = tuple[int, float, float, float]
-"""A share that was counted: number of the reactor, share, its sd, minute of the run at which it was drawn."""
+"""What was counted in a sample: number of the reactor, value, its sd, minute of the run at which it was drawn."""
 Span = tuple[float, float]
 Answer = tuple[str, bool]
 """What came of a sample, in words, and whether that is worth a warning."""
 
 
 @runtime_checkable
+class Knows(Protocol):
+    """A signal that tells, in a simulation, what it only believes elsewhere."""
+
+    def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
+        """Take the vials themselves. Args: flow_ml_s: of a pump as the driver takes it."""
+
+
+@runtime_checkable
+class Draws(Protocol):
+    """A signal that has figures of its own."""
+
+    def figures(self, table: Any, title: str) -> Mapping[str, Any]:
+        """Draw them, by name, at the end of a run. Args: table: its recordings (`experiments/record/record.py`)."""
+
+
+@runtime_checkable
 class Counted(Protocol):
     """A signal that learns from samples which somebody counted."""
 
-    def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
-        """Take a share of reactor n at a minute of the run, with its sd; return what came of it."""
+    def counted(self, n: int, value: float, sd: float, minute: float) -> Answer:
+        """Take what was counted of reactor n at a minute of the run, with its sd; return what came of it."""
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
         """Replay what earlier lives of the run recorded: columns of each reactor, and every sample.
@@ -229,9 +247,11 @@ class Density:
         why = self.law.explain() if isinstance(self.law, Explains) else {}
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
-        alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
-        said = messages.FilterAlarm().line("reported")
-        return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())
+        warnings: list[str | None] = [None] * sample.rows.size
+        for key, then in (("noted", "the policy goes on"), ("alarm", "the controller on a second filter decides")):
+            for n in np.flatnonzero(why.get(key, np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))):
+                warnings[n] = messages.FilterAlarm(then=then).line("reported")
+        return Findings(why=why, warnings=warnings if any(warnings) else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`."""

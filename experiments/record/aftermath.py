@@ -1,7 +1,7 @@
 """After a run: what its model predicted beside what the recordings show, as a section of the run's page."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from conf import guests
 from conf.schema import build
 from dqn import policy as policies
 from envs.bench import Bench
@@ -20,18 +21,18 @@ from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
 from experiments.loop.signals import ESTIMATED, within_2sd
-from experiments.reporting.calibration_charts import agreement_figure
-from experiments.reporting.charts import save
+from experiments.recordings.reader import read_recording
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Table, number, span
 from hardware.errors import RecordingError
-from hardware.storage.recording_reader import read_recording
 
-__all__ = ["Believed", "believed", "decisions", "write"]
+__all__ = ["INCOMPARABLE", "Believed", "believed", "decisions", "write"]
 
 Array = NDArray[np.float64]
 
 DECISION = '"kind":"decision"'
+INCOMPARABLE: list[Callable[[Mapping[str, Any]], str]] = []
+"""From the config of a run to why no model is compared with it, "" where one is; a guest adds its own."""
 ESTIMATES = ("mu", "gain")  # what a controller may believe of culture and pump
 COLUMNS = ("hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net growth beyond the model's, 1/min")
 
@@ -124,8 +125,9 @@ def write(page: Page, run: Path, label: str = "") -> None:
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     reactors = summary.get("reactors") if isinstance(summary, Mapping) else None
     page.section(f"{label}: predicted and measured" if label else "Predicted and measured")
-    if _config(run).get("composition"):
-        page.text("Not compared: the growth of two species follows their share, and the model is of one species.")
+    guests.load("experiments.record")
+    for why in filter(None, (reason(_config(run)) for reason in INCOMPARABLE)):
+        page.text(f"Not compared: {why}.")
         return
     own = {name: model.tau * ml / bench.volume_ml for name, ml in bench.volumes_ml.items()}
     told = "".join(f", {number(tau, 4)} of {name}" for name, tau in own.items())
@@ -159,6 +161,9 @@ def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mappin
         )
         page.table(_segments(found, f"{prefix}after_{name}", name))
         estimates = {key: values for key, values in why.items() if key in ("minute", *ESTIMATES)}
+        from experiments.reporting.calibration_charts import agreement_figure  # Matplotlib, only where one is drawn
+        from experiments.reporting.charts import save
+
         figure = agreement_figure(found, estimates, supervised, f"{name}: growth and pump along the run")
         page.figure(save(figure, run / "report", name).with_suffix(".svg"), f"{name}, predicted and measured")
 

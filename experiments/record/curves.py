@@ -9,29 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.loop.loop import Step
-from experiments.loop.signals import AIM
 from experiments.reporting import tables
-from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
+from experiments.reporting.curves import BAND, CALLED, COLUMNS, DEPLOYMENT, PAGES, error_tag, signals_in
 from experiments.reporting.tensorboard import Events
 
 __all__ = ["Curves"]
 
 Array = NDArray[np.float64]
 
-NAMES = {  # of the columns that the share adds to a recording; those of other signals keep theirs below further/
-    AIM: "culture/aim",
-    "fluorescence": "share/fluorescence",
-    "ratio_setpoint": "share/setpoint",
-    "ratio": "share/estimate",
-    "ratio_low": "share/low",
-    "ratio_high": "share/high",
-    "true_ratio": "share/true",
-    "temperature_target_degc": "culture/temperature_target_degc",
-}
 WINDOW = {
     "reactor": "reactor", "setpoint": "setpoint, OD", "start_min": "from, min", "end_min": "to, min",
     "steady_abs_error": "steady error, OD", "settling_min": "settled after, min", "ise": "ISE, OD² min",
-    "ratio_abs_error_mean": "error of the share",
 }  # fmt: skip
 
 
@@ -42,20 +30,21 @@ class Curves:
     of some seconds too.
 
     Args:
-      folder: run folder. names: of the reactors. composed: a share is controlled.
+      folder: run folder. names: of the reactors. columns: that the recordings have.
       first_minute: where a resumed run goes on, or 0.
       began: when the run began, s since 1970; None: now.
     """
 
     def __init__(
-        self, folder: Path, names: Sequence[str], composed: bool, first_minute: int, began: float | None
+        self, folder: Path, names: Sequence[str], columns: Sequence[str], first_minute: int, began: float | None
     ) -> None:
         self._folder, self._names, self._last = folder, tuple(names), first_minute
         self._began = time.time() if began is None else began
         self.run = Events(folder, first_minute)
         single = len(names) == 1
         self._each = [self.run if single else Events(folder / "reactors" / name, first_minute) for name in names]
-        self.run.layout({**DEPLOYMENT, **(SHARES if composed else {})})
+        further = [PAGES[column] for column in columns if column in PAGES]
+        self.run.layout({page: charts for pages in (DEPLOYMENT, *further) for page, charts in pages.items()})
         path = folder / "config.yaml"
         if path.is_file():
             self.run.text("run/config", f"```yaml\n{path.read_text(encoding='utf-8')}\n```")
@@ -71,7 +60,7 @@ class Curves:
             "culture/setpoint_high": setpoint * (1.0 + BAND),
             "culture/temperature_degc": step.temperature,
             "pump/rate_ml_s": step.rate,
-            **{NAMES.get(key, f"further/{key}"): value for key, value in step.columns.items()},
+            **{COLUMNS.get(key, f"further/{key}"): value for key, value in step.columns.items()},
             **{f"controller/{key}": value for key, value in step.explanation.items() if value.ndim == 1},
         }
         for n in map(int, np.flatnonzero(step.rows)):
@@ -112,17 +101,19 @@ def _results(summary: Mapping[str, Any]) -> dict[str, float]:
         values = [w.get(key) for w in summary["windows"]]
         return np.array([v for v in values if v is not None and np.isfinite(v)])
 
-    steady, ise, shares = (known(key) for key in ("steady_abs_error", "ise", "ratio_abs_error_mean"))
+    steady, ise = known("steady_abs_error"), known("ise")
+    errors = {signal: known(f"{signal}_abs_error_mean") for signal in signals_in(summary["windows"])}
     return {
         "result/steady_abs_error": float(steady.max()) if steady.size else float("nan"),
         "result/ise": float(ise.sum()) if ise.size else float("nan"),
-        "result/share_abs_error": float(shares.mean()) if shares.size else float("nan"),
+        **{error_tag(signal): float(found.mean()) for signal, found in errors.items() if found.size},
         "result/medium_ml": float(summary["volume_ml"]),
     }
 
 
 def _table(windows: Sequence[Mapping[str, Any]]) -> str:
     """Format the windows in Markdown."""
-    columns = [key for key in WINDOW if any(key in w for w in windows)]
-    rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in columns] for w in windows]
-    return tables.markdown([WINDOW[key] for key in columns], rows)
+    of_signals = {f"{s}_abs_error_mean": f"error of the {CALLED.get(s, s)}" for s in signals_in(windows)}
+    titles = {key: title for key, title in (WINDOW | of_signals).items() if any(key in w for w in windows)}
+    rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in titles] for w in windows]
+    return tables.markdown(list(titles.values()), rows)

@@ -50,6 +50,10 @@ class Recordings:
         """OD, nan where the interlock did not believe it, or, if `refused`, where it did; (N, K)."""
         return np.where((self.columns["believed"] == 0.0) == refused, self.columns["od"], np.nan)
 
+    def setpoints(self) -> Array:
+        """Setpoint of the OD, nan in a recovery, which has none; (N, K)."""
+        return np.where(self.columns["phase"] >= 0, self.columns["setpoint"], np.nan)
+
 
 class Record:
     """Journal, recordings, state and events of one run.
@@ -84,7 +88,7 @@ class Record:
         self.repairs += self._completed(self.journal.rows)
         began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
         newest = max((float(rows.columns["time_min"][-1]) for rows in self.rows if len(rows)), default=-1.0)
-        self.curves = Curves(self.folder, self.names, "ratio" in columns, round(newest) + 1, began)
+        self.curves = Curves(self.folder, self.names, columns, round(newest) + 1, began)
 
     def complete(self) -> None:
         """Write what the end of the loop kept from being written, as the journal has it: rows, and what doses came to.

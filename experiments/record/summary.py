@@ -14,23 +14,21 @@ from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.messages import FilterAlarm
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
-from experiments.loop.share import program_of
 from experiments.loop.signals import AIM
 from experiments.record import messages
 from experiments.record.record import Recordings
-from experiments.record.recovery import Array, Rows
+from experiments.record.recovery import Rows
 from experiments.reporting import charts
-from experiments.reporting.composition_charts import composition_figure
+from experiments.reporting.curves import CALLED, signals_in
 from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 
 __all__ = [
     "ChangeLog",
-    "composition_figure_of",
     "figure_of",
     "metrics_table",
     "reasons_line",
-    "shares_table",
+    "signals_table",
     "summarise",
 ]
 
@@ -73,9 +71,10 @@ class ChangeLog:
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._window(step, n)
                 self._phase[n] = int(step.phase[n])
-                share = step.columns.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
-                what += f", share {share:g}" if np.isfinite(share) else ""
+                for signal in signals_in([step.columns]):
+                    asked = step.columns[f"{signal}_setpoint"][n]
+                    what += f", {CALLED.get(signal, signal)} {asked:g}" if np.isfinite(asked) else ""
                 log.info(messages.PhaseBegins(reactor=name, what=what, minute=step.minute[n], od=step.od[n]))
             if step.rows[n]:
                 self._who_decides(step, n)
@@ -225,23 +224,22 @@ def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, A
     return found
 
 
-def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a head and one line per window in which a share was asked for; "" if there is none."""
-    keys = {"asked": "ratio_setpoint", "mean |e|": "ratio_abs_error_mean", "last 2 h": "ratio_abs_error_last2h"}
-    keys |= {"true |e|": "true_ratio_abs_error_mean", "OD |e|": "od_abs_error_mean"}
-    kept = [w for w in windows if np.isfinite(w.get("ratio_abs_error_mean", np.nan))]
-    known = {head: key for head, key in keys.items() if kept and key in kept[0]}
-    lines = [f"{'reactor':8} {'hours':>11} " + " ".join(f"{head:>8}" for head in known)]
-    for w in kept:
-        hours = f"{w['start_min'] / 60:.1f}-{w['end_min'] / 60:.1f}"
-        cells = [f"{'varies':>8}" if w[key] is None else _cell(w[key]) for key in known.values()]
-        lines.append(f"{w['reactor']:8} {hours:>11} " + " ".join(cells))
-    return "\n".join(lines) if kept else ""
-
-
-def _setpoint(table: Recordings) -> Array:
-    """Return the setpoint of the OD, nan in a recovery, which has none; (N, K)."""
-    return np.where(table.columns["phase"] >= 0, table.columns["setpoint"], np.nan)
+def signals_table(windows: Sequence[Mapping[str, Any]]) -> str:
+    """Format a head and one line per window in which another signal was to be held; "" if there is none."""
+    lines = []
+    for signal in signals_in(windows):
+        keys = {"asked": f"{signal}_setpoint", "mean |e|": f"{signal}_abs_error_mean"}
+        keys |= {"last 2 h": f"{signal}_abs_error_last2h", "true |e|": f"true_{signal}_abs_error_mean"}
+        keys["OD |e|"] = "od_abs_error_mean"
+        kept = [w for w in windows if np.isfinite(w.get(keys["mean |e|"], np.nan))]
+        known = {head: key for head, key in keys.items() if kept and key in kept[0]}
+        if kept:
+            lines.append(f"{CALLED.get(signal, signal):8} {'hours':>11} " + " ".join(f"{head:>8}" for head in known))
+        for w in kept:
+            hours = f"{w['start_min'] / 60:.1f}-{w['end_min'] / 60:.1f}"
+            cells = [f"{'varies':>8}" if w[key] is None else _cell(w[key]) for key in known.values()]
+            lines.append(f"{w['reactor']:8} {hours:>11} " + " ".join(cells))
+    return "\n".join(lines)
 
 
 def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> Figure:
@@ -249,21 +247,7 @@ def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> F
     c = table.columns
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = c["temperature_degc"].T if switched else None
-    series = (c["time_min"].T, table.od().T, _setpoint(table).T, c["pump_rate_ml_s"].T)
+    series = (c["time_min"].T, table.od().T, table.setpoints().T, c["pump_rate_ml_s"].T)
     aim = c[AIM].T if AIM in c else None
     marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks if m.share is None]
     return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T, aim)
-
-
-def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
-    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
-    announced, counted = [], []
-    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
-        began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
-        minute, share = program_of(scenario).announcements(scenario.announced_min)
-        known = minute + began <= np.nanmax(table.columns["time_min"][n], initial=-np.inf)  # a run may end before
-        announced.append((minute[known] + began, share[known]))
-        mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
-        counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
-    columns = {**table.columns, "od": table.od(), "setpoint": _setpoint(table)}
-    return composition_figure(columns, table.names, species, title, announced, counted)

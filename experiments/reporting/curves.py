@@ -5,14 +5,16 @@ docs/tensorboard.md explains the same tags to whoever looks at them.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 __all__ = [
-    "BAND", "CURVES", "DEPLOYMENT", "ERROR_UNITS", "METRICS", "PARAMETERS", "PICTURES", "POPULATION", "SHARES",
-    "TRAINING", "Chart", "Column", "Curve", "described", "of_population",
+    "BAND", "CALLED", "COLUMNS", "CURVES", "DEPLOYMENT", "ERROR_UNITS", "METRICS", "PAGES", "PARAMETERS", "PICTURES",
+    "POPULATION", "TRAINING", "Chart", "Column", "Curve", "add", "described", "error_tag", "line", "of_population",
+    "signals_in",
 ]  # fmt: skip
 
-ERROR_UNITS = {"density": "OD", "relative": "periods of full pump", "coculture": "of the share"}
-"""Task -> unit of its steady error."""
+ERROR_UNITS = {"density": "OD", "relative": "periods of full pump"}
+"""Task -> unit of its steady error; a guest adds its own."""
 BAND = 0.05  # of the setpoint: the band in which a culture counts as settled
 POPULATION = {"iqm": "mean of the middle half of the agents", "min": "lowest agent", "max": "highest agent"}
 
@@ -53,12 +55,6 @@ CURVES = {
     "culture/temperature_target_degc": Curve("°C", "the thermostat's target"),
     "pump/rate_ml_s": Curve("mL/s", "mean feed rate of the coming period, after the interlock"),
     "safety/interlock": Curve("", "1 where the interlock or a warning spoke"),
-    "share/estimate": Curve("", "share of the second species as estimated"),
-    "share/low": Curve("", "lower end of the estimate's 95 % band"),
-    "share/high": Curve("", "upper end of the estimate's 95 % band"),
-    "share/setpoint": Curve("", "share asked for"),
-    "share/true": Curve("", "share in truth, which only a simulation knows"),
-    "share/fluorescence": Curve("counts", "fluorescence as measured"),
     "controller/q_best": Curve("reward", "Q value of the chosen pump rate"),
     "controller/q_lead": Curve("reward", "its lead over the second best"),
     "controller/error": Curve("periods of full pump", "error that the policy saw"),
@@ -77,20 +73,10 @@ CURVES = {
     "controller/i": Curve("1/min", "integral part of pi_tuned"),
     "controller/i1": Curve("mL/s", "first integral part of the device's PI"),
     "controller/i2": Curve("mL/s", "second integral part of the device's PI"),
-    "controller/bias_e": Curve("", "relative error of the first species' growth curve, as estimated"),
-    "controller/bias_p": Curve("", "relative error of the second species' growth curve, as estimated"),
-    "controller/bias_e_sd": Curve("", "how unsure the first of these errors is, sd"),
-    "controller/bias_p_sd": Curve("", "how unsure the second of these errors is, sd"),
-    "controller/thermometer_error": Curve("degC", "true less measured temperature, as estimated"),
-    "controller/dose_spread": Curve("", "sd of a dose over its size, as estimated, at least as configured"),
-    "controller/dose_gain": Curve("", "dose over the dose that was asked for, as estimated"),
-    "controller/composition_od": Curve("OD", "density as the estimate of the share believes it"),
-    "controller/pigment": Curve("counts", "fluorescence of the pigment as estimated"),
     # at the end
     "result/regret_pct": Curve("%", "cost beyond the optimum's on the reported grid"),
     "result/steady_abs_error": Curve("OD for env=sim", "error at rest at the worst setpoint"),
     "result/ise": Curve("OD² min", "integral of the squared error over the schedule"),
-    "result/share_abs_error": Curve("", "mean error of the share, where one was asked for"),
     "result/medium_ml": Curve("mL", "fresh medium used by all reactors"),
 }
 PICTURES = {
@@ -98,7 +84,6 @@ PICTURES = {
     "figures/policy_map": "pump rate over OD and setpoint, learned and optimal",
     "figures/trajectories": "closed loops of the learned policy beside the optimum's",
     "figures/closed_loop": "OD over setpoint, pump rate, temperature of a deployment",
-    "figures/composition": "share, temperature, OD and fluorescence of a deployment",
     "figures/certificate": "what is proven of the closed loop",
 }
 
@@ -119,7 +104,8 @@ class Chart:
     bands: Sequence[tuple[str, str, str]] = ()
 
 
-def _line(tag: str) -> tuple[str, str, str]:
+def line(tag: str) -> tuple[str, str, str]:
+    """Return a band that is a line."""
     return (tag, tag, tag)
 
 
@@ -140,7 +126,7 @@ def of_population(pages: Mapping[str, Mapping[str, Chart]]) -> Mapping[str, Mapp
 
     def band(tag: str) -> tuple[str, str, str]:
         one = tag.startswith("limit/") or tag == "train/epsilon"
-        return _line(tag) if one else (f"{tag}/iqm", f"{tag}/min", f"{tag}/max")
+        return line(tag) if one else (f"{tag}/iqm", f"{tag}/min", f"{tag}/max")
 
     return {  # TensorBoard shows charts with bands in reverse
         f"{page}, several agents": {t: Chart(bands=[band(x) for x in charts[t].lines]) for t in reversed(list(charts))}
@@ -151,7 +137,7 @@ def of_population(pages: Mapping[str, Mapping[str, Chart]]) -> Mapping[str, Mapp
 DEPLOYMENT: Mapping[str, Mapping[str, Chart]] = {
     "Density": {
         "OD and setpoint with its band of 5 %": Chart(
-            bands=[("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high"), _line("culture/od")]
+            bands=[("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high"), line("culture/od")]
         ),
     },
     "Pump, heat, interlock": {
@@ -160,14 +146,23 @@ DEPLOYMENT: Mapping[str, Mapping[str, Chart]] = {
         "Interlock and warnings": Chart(["safety/interlock", "controller/supervised"]),
     },
 }
-SHARES: Mapping[str, Mapping[str, Chart]] = {
-    "Two species": {
-        "Share of the second species with its 95 % band": Chart(
-            bands=[("share/estimate", "share/low", "share/high"), _line("share/setpoint")]
-        ),
-        "Fluorescence, counts": Chart(["share/fluorescence"]),
-    }
-}
+COLUMNS = {"aim": "culture/aim"}
+"""Column that a signal adds to a recording -> its tag; that of any other is further/COLUMN."""
+CALLED: dict[str, str] = {}
+"""Column of a signal -> the word for it in tags and tables, where that is another."""
+PAGES: dict[str, Mapping[str, Mapping[str, Chart]]] = {}
+"""Column of a signal -> pages of charts that a run with it has beside those of `DEPLOYMENT`."""
+
+
+def signals_in(windows: Sequence[Mapping[str, object]]) -> list[str]:
+    """List the signals, by their columns, that were to be held beside the density in any window of a summary."""
+    ends = [key for window in windows for key in window if key.endswith("_setpoint")]
+    return list(dict.fromkeys(key.removesuffix("_setpoint") for key in ends))
+
+
+def error_tag(signal: str) -> str:
+    """Return the tag of a signal's mean error over the windows of a run. Args: signal: its column."""
+    return f"result/{CALLED.get(signal, signal)}_abs_error"
 
 
 @dataclass(frozen=True)
@@ -198,5 +193,21 @@ METRICS = {
     "result/regret_pct": "regret, %",
     "result/steady_abs_error": "worst-setpoint error, OD",
     "result/ise": "ISE, OD² min",
-    "result/share_abs_error": "error of the share",
 }
+
+
+TABLES: tuple[dict[str, Any], ...] = (ERROR_UNITS, CURVES, COLUMNS, CALLED, PAGES, METRICS, PICTURES)
+
+
+def add(
+    units: Mapping[str, str],
+    curves: Mapping[str, Curve],
+    columns: Mapping[str, str],
+    called: Mapping[str, str],
+    pages: Mapping[str, Mapping[str, Mapping[str, Chart]]],
+    metrics: Mapping[str, str],
+    pictures: Mapping[str, str],
+) -> None:
+    """Say how TensorBoard and pages show what a guest brings. Args: more of `ERROR_UNITS`, `CURVES` and so on."""
+    for known, more in zip(TABLES, (units, curves, columns, called, pages, metrics, pictures), strict=True):
+        known.update(more)

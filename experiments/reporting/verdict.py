@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.reporting.curves import BAND, ERROR_UNITS
+from experiments.reporting.curves import BAND, CALLED, ERROR_UNITS, signals_in
 from experiments.reporting.tables import count, number
 
 __all__ = ["REMEDY", "Headline", "verdict"]
@@ -89,9 +89,11 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
     steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
     items = [f"fresh medium {number(summary['volume_ml'])} mL"]
     items += [f"interlock spoke in {count(sum(r['interlock'] for r in summary['reactors'].values()), 'sample')}"]
-    shares = [w["ratio_abs_error_mean"] for w in windows if w.get("ratio_abs_error_mean") is not None]
-    if shares:
-        items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")
+    for signal in signals_in(windows):
+        errors = [w[key] for w in windows if w.get(key := f"{signal}_abs_error_mean") is not None]
+        if errors:
+            said = number(float(np.mean(errors)))
+            items.append(f"mean error of the {CALLED.get(signal, signal)} {said}, as estimated")
     if not steady:
         return Headline(claim, items, "No window was long enough to say how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
@@ -122,6 +124,11 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
         f"PMSE {number(summary['pmse_pct'])} % of the squared OD; {summary['n_used']} readings used, "
         f"{summary['n_rejected']} rejected",
     ]
+    items += [
+        f"the first half predicts the second {a['minutes']:.0f} min ahead within {number(a['model_pct'], 2)} % rms "
+        f"(the OD stays {number(a['od_stays_pct'], 2)} %, the slope goes on {number(a['same_slope_pct'], 2)} %)"
+        for a in summary["validation"].get("ahead", [])
+    ]
     against = "; ".join(summary["warnings"])
     return Headline(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")
 
@@ -139,7 +146,34 @@ def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
     return Headline(claim, items, f"{said}. What helps: {REMEDY}.")
 
 
+def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
+    inside, doses, twin = summary["inside_pct"], summary["doses_pct"], summary["twin"]
+    data = Path(config["data"]).name if config.get("data") else "the shipped recording"
+    claim = f"Replay of {data}: {number(inside['one'])} % of the readings lay inside their 95 % band, and "
+    claim += f"{number(inside['ten'])} % inside that of {summary['ahead']} readings before."
+    items = [f"{name} {number(low)} to {number(high)}" for name, (low, high) in _spreads(summary)]
+    items += [
+        f"doses at OD {number(summary['setpoint'])}: both {doses['both']:.0f} % of readings, neither "
+        f"{doses['neither']:.0f} %, the device alone {doses['device']:.0f} %, the controller alone "
+        f"{doses['controller']:.0f} %",
+        f"not believed {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
+        "the interlock told " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "nothing"),
+    ]
+    if "none" in twin:
+        return Headline(claim, items, f"No closed loop on a twin: {twin['none']}.")
+    error = f"holds OD {number(summary['setpoint'])} with a mean error of {number(twin['mean_abs_error'])} OD"
+    return Headline(claim, items, f"On the recording's twin the controller {error} for {twin['hours']:.0f} h.")
+
+
+def _spreads(summary: Summary) -> list[tuple[str, tuple[float, float]]]:
+    """Growth rate, and the pump's flow in per cent of its setting; nothing that no estimator knew."""
+    scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("pump, % of its setting,", 100.0)}
+    known = [(name, scale, summary[key]) for key, (name, scale) in scales.items() if summary[key] is not None]
+    return [(name, (scale * low, scale * high)) for name, scale, (low, high) in known]
+
+
 KINDS = {
+    "doses_pct": _replay,
     "train_seconds": _training,
     "windows": _deployment,
     "net_growth": _calibration,

@@ -40,8 +40,8 @@ def _dqn(config: DQNConfig, task: Task, streams: Streams, device: str) -> DQNAge
     if width not in (0, seen):
         raise ValueError(
             f"agent.input_matrix has rows of {width} numbers, this task observes {seen} "
-            f"({', '.join(task.observation)}): choose the agent of the task, e.g. agent=coculture for env=coculture, "
-            "agent=coculture_preview for env=coculture_preview, agent=relative for env=relative, or agent=paper"
+            f"({', '.join(task.observation)}): choose the agent of the task, which has its name (agent=relative for "
+            "env=relative), or agent=paper"
         )
     return DQNAgent(config, seen, task.actions.size, streams, task.hindsight(config), device)
 

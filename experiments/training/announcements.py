@@ -65,12 +65,12 @@ def _verdict(score: Score, task: Task) -> str:
 
 
 def ended(
-    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, pair: str | None = None,
+    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, words: str = "",
     whole: bool = True,
 ) -> None:  # fmt: skip
     """Log the result, its comparison, and the next step.
 
-    Args: spent: steps, updates and time, as text. pair: of two species, as requested. whole: the training did all its
+    Args: spent: steps, updates and time, as text. words: of the next command line. whole: the training did all its
     steps.
     """
     many = kept.regret_pct.size > 1
@@ -88,8 +88,8 @@ def ended(
         good = (kept.regret_pct <= task.regret_unit) & (kept.steady_abs_error <= task.steady_unit)
         if task.provable and whole and good.any():  # a certificate is rare beyond the limits, or at them
             log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
-        pair_words = "" if pair is None else f"pair={shlex.quote(pair)} "
-        log.info("next, try it: python -m experiments.deploy %s%s", pair_words, task.tried.format(file))
+        said = " ".join(filter(None, (words, task.tried.format(file))))
+        log.info("next, try it: python -m experiments.deploy %s", said)
 
 
 def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path) -> None:

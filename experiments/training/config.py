@@ -1,18 +1,61 @@
 """The config of a training run. Free of torch."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from conf.messages import NotAllowed
+from conf import presets
+from conf.messages import NameTaken, NotAllowed
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
-from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 
-__all__ = ["AGENTS", "ENVS", "TrainConfig", "agent_schema", "env_schema"]
+__all__ = ["AGENTS", "ENVS", "TASKS", "TrainConfig", "add", "agent_schema", "env_schema"]
 
-ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
+ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig}
+
+
+@dataclass(frozen=True)
+class TaskKind:
+    """How a task is made of its config, and what it makes of a training run's config.
+
+    make: called with the config, returns a `Task` (`experiments/training/tasks.py`).
+    completed: reads the files that the run's config names; None: `env_file` is a calibrated.yaml, which replaces env.
+    repeats: keys of the run's config that `deploy` has, too, and is to be told alike.
+    """
+
+    make: Callable[[Any], Any]
+    completed: Callable[["TrainConfig"], "TrainConfig"] | None = None
+    repeats: tuple[str, ...] = ()
+
+
+TASKS: dict[type[Any], TaskKind] = {}
+"""By the class of their config."""
+
+
+def add(
+    kind: str,
+    config: type[Any],
+    task: Callable[[Any], Any],
+    what: str,
+    completed: Callable[["TrainConfig"], "TrainConfig"] | None = None,
+    repeats: tuple[str, ...] = (),
+) -> None:
+    """Make a task known as `train env=KIND`.
+
+    Args:
+      kind: its name, the default of the field `kind` of `config`.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
+      what: the sentence that the help shows; "": it has a preset of conf/, whose words are shown.
+      task, completed, repeats: as of `TaskKind`.
+    Raises: ValueError for a kind that exists.
+    """
+    if kind in ENVS:
+        raise NameTaken(what="env", name=kind)
+    if what:
+        presets.add(f"env/{kind}", {"kind": kind}, what)
+    ENVS[kind], TASKS[config] = config, TaskKind(task, completed, repeats)
 
 
 def env_schema(kind: str, key: str = "env") -> Any:
@@ -38,14 +81,9 @@ class TrainConfig:
 
     env: Any = part(EnvConfig, "the training model and its episodes", env_schema)
     agent: Any = part(DQNConfig, "the agent's hyper-parameters", agent_schema)
-    pair: str | None = setting(
-        None,
-        "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",
-    )
     env_file: str | None = setting(
         None,
-        "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env. For env=coculture and "
-        "coculture_preview also a run with a composition: its growth curves",
+        "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env. For other tasks as their page says",
     )
     seed: int = setting(0, "seed of the first agent", at_least=0)
     n_agents: int = setting(1, "number of agents, with seeds seed, seed + 1, ... in one process", within=(1, 100_000))

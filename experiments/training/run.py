@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import shlex
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,14 +14,13 @@ from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
 from dqn.policy import Policy
-from envs.coculture.task import CocultureConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
-from experiments.cli.calibrated import read_curves, read_env_file, read_pair
+from experiments.cli.calibrated import read_env_file
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training import announcements
-from experiments.training.config import TrainConfig
+from experiments.training.config import TASKS, TrainConfig
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
 
@@ -35,16 +35,8 @@ def train(config: TrainConfig, folder: Path) -> float:
     Merit is that of `session.merit` on the selection grid: 1 is the limit of the task, lower is better. The reported
     grid is not used to choose hyper-parameters.
     """
-    if config.env_file is not None:
-        composed = isinstance(config.env, CocultureConfig)
-        env = read_curves(config.env_file, config.env) if composed else read_env_file(config.env_file)
-        config = replace(config, env=env, env_file=None)
-        frame.save_config(config, folder)
-    if config.pair is not None and config.resume is None:  # a resumed run has it in env.pair
-        if not isinstance(config.env, CocultureConfig):
-            raise frame.UserError(f"pair={config.pair}: a task of one species; give env=coculture_preview beside it")
-        with frame.refusing(ValueError):
-            config = replace(config, env=replace(config.env, pair=read_pair(config.pair)))
+    if (whole := _completed(config)) is not config:
+        config = whole
         frame.save_config(config, folder)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
@@ -62,6 +54,14 @@ def train(config: TrainConfig, folder: Path) -> float:
     finally:
         session.writer.close()
     return float(session.best.merit.max())
+
+
+def _completed(config: TrainConfig) -> TrainConfig:
+    """With what the files hold that it names. Raises: UserError."""
+    own = TASKS[type(config.env)].completed
+    if own is not None:
+        return own(config)
+    return config if config.env_file is None else replace(config, env=read_env_file(config.env_file), env_file=None)
 
 
 def _warn_of_growth(env: EnvConfig) -> None:
@@ -109,7 +109,13 @@ def _finish(session: Session) -> None:
     spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
     config = session.config
     whole = config.stop_within is None
-    announcements.ended(session.folder, session.task, kept, myopic, spent, path, config.pair, whole)
+    announcements.ended(session.folder, session.task, kept, myopic, spent, path, _repeated(config), whole)
+
+
+def _repeated(config: TrainConfig) -> str:
+    """Words of the command line that `deploy` is to be told, too."""
+    given = {key: getattr(config, key) for key in TASKS[type(config.env)].repeats}
+    return " ".join(f"{key}={shlex.quote(value)}" for key, value in given.items() if value is not None)
 
 
 def fingerprint(config: TrainConfig) -> str:

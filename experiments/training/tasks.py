@@ -1,23 +1,19 @@
 """Tasks of a training run; `of` returns the task of an environment's config."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from conf import presets
-from conf.messages import NameTaken
 from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.policy import Policy
 from dqn.trainer import TrainingEnv
-from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
-from experiments.training.coculture import Coculture
-from experiments.training.config import ENVS
+from experiments.training.config import ENVS, TASKS, TaskKind, add
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluated
 from experiments.training.relative import Relative
@@ -73,26 +69,7 @@ class Task(Evaluated, Protocol):
         """Draw the policy map and example trajectories beside the optimum's."""
 
 
-TASKS: dict[type[Any], Callable[[Any], Task]] = {
-    EnvConfig: DensityTask,
-    RelativeConfig: Relative,
-    CocultureConfig: Coculture,
-}
-
-
-def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) -> None:
-    """Register a task as `train env=KIND`.
-
-    Args:
-      kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      task: called with the config. what: sentence in the help.
-    Raises: ValueError for a kind that exists.
-    """
-    if kind in ENVS:
-        raise NameTaken(what="env", name=kind)
-    presets.add(f"env/{kind}", {"kind": kind}, what)
-    ENVS[kind], TASKS[config] = config, task
+TASKS |= {EnvConfig: TaskKind(DensityTask), RelativeConfig: TaskKind(Relative)}
 
 
 def kind(config: Any) -> str:
@@ -102,4 +79,5 @@ def kind(config: Any) -> str:
 
 def of(config: Any) -> Task:
     """Return the task of an environment's config."""
-    return TASKS[type(config)](config)
+    task: Task = TASKS[type(config)].make(config)
+    return task

@@ -88,5 +88,4 @@ class EmulatorConfig(ChiBioConfig):
     plant: str = setting(
         "healthy", "preset of cultures and pumps; bench: every vial is different", choices=tuple(groups()["plant"])
     )
-    pair: str = setting("ecoli_pputida", "two species: a preset of conf/strains, or a pair.yaml")
     seed: int = setting(0, "random seed of all noise", at_least=0)

@@ -4,10 +4,10 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 from envs.bench import Bench
-from envs.coculture.pair import named_pair
-from envs.plant.plant import PlantConfig, of_pair
+from envs.plant.plant import TOLD, PlantConfig, told
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.family import ChiBioFamily, Link, linked
 from hardware.clock import VirtualClock
@@ -19,18 +19,22 @@ from hardware.emulator.transport import EmulatorTransport
 __all__ = ["FAMILY", "EmulatorFamily"]
 
 log = logging.getLogger(__name__)
-EMULATED = ("speed", "seed", "od", "plant", "pair")  # values of backend=emulator that its process is started with
-TWO = "coculture"  # preset of vials with two species
+EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
 
 
 def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
     """Build the command line of the device's process."""
-    arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
+    arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}, **_told(backend)}
     arguments["volume"] = ",".join(f"{ml:g}" for ml in bench.volumes(backend.reactors))
     if (overflow := backend.overflow_pump).pump:
         arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
     arguments |= {f"{pump.lower()}-flow": backend.supply.flow_ml_s(pump) for pump in backend.supply.pumps}
     return [word for k, v in arguments.items() for word in (f"--{k}", str(v))]
+
+
+def _told(backend: EmulatorConfig) -> dict[str, str]:
+    """Return what its vials are told beside their preset."""
+    return {key: getattr(backend, key, usual) for key, (usual, _, _) in TOLD.items()}
 
 
 class EmulatorFamily(ChiBioFamily):
@@ -58,14 +62,14 @@ class EmulatorFamily(ChiBioFamily):
             with linked(backend, url) as link:
                 yield link
 
-    def coculture(self, backend: EmulatorConfig, pair: str) -> EmulatorConfig:
-        """Of the preset with two species, where another was not chosen, of the pair that the run is for."""
-        plant = TWO if backend.plant == EmulatorConfig().plant else backend.plant
-        return replace(backend, plant=plant, pair=pair)
+    def holding(self, backend: EmulatorConfig, preset: str, **values: Any) -> EmulatorConfig:
+        """See `Family.holding`."""
+        plant = preset if backend.plant == EmulatorConfig().plant else backend.plant
+        return replace(backend, plant=plant, **values)
 
     def vials(self, backend: EmulatorConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
         """Of the preset `backend.plant`."""
-        return "backend.plant", of_pair(plant_preset(backend.plant), named_pair(backend.pair))
+        return "backend.plant", told(plant_preset(backend.plant), _told(backend))
 
     def address(self, backend: ChiBioConfig) -> str:
         """In a process of this computer."""

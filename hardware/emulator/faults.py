@@ -65,7 +65,7 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
-    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; of no effect on cultures of one species"),
+    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; of no effect where nothing gives light"),
     "fp_dead": ("plant", "0 or 1", "fluorescence reads 0; likewise"),
     "fp_saturated": ("plant", "0 or 1", "fluorescence reads full scale; likewise"),
 }

@@ -11,7 +11,7 @@ __all__ = ["Optics"]
 
 EXPOSURE_S = 0.97  # one spectrometer reading
 FLUORESCENCE_S = 1.0  # LED on, one reading, LED off
-PYOVERDINE = ("LEDA", "nm440")  # 395 nm in, 440 nm out (docs/plant.md, Two species)
+PYOVERDINE = ("LEDA", "nm440")  # 395 nm in, 440 nm out (docs/plant.md)
 DARK_BASE = 120.0  # counts of the base band where no culture fluoresces
 BASE = 20000.0  # and where one does
 

@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 
 from conf.presets import groups
-from envs.coculture.pair import named_pair
-from envs.plant.plant import of_pair
+from envs.plant.plant import TOLD, told
 from hardware.clock import Clock, DeviceClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
@@ -230,7 +229,8 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
     add("--volume", default="20", help="culture, mL, one for all or one per reactor (default %(default)s)")
-    add("--pair", default="ecoli_pputida", help="of two species: a preset or a pair.yaml (default %(default)s)")
+    for key, (usual, what, _) in TOLD.items():
+        add(f"--{key}", default=usual, help=f"{what} (default %(default)s)")
     add("--until-eof", action="store_true", help="end when standard input ends: with the process that holds it")
     add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
     plants = groups()["plant"]
@@ -269,7 +269,7 @@ def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDe
         overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
         pump3_ml_s=arguments.pump3_flow, pump4_ml_s=arguments.pump4_flow,
     )  # fmt: skip
-    plant = of_pair(plant_preset(arguments.plant), named_pair(arguments.pair))
+    plant = told(plant_preset(arguments.plant), vars(arguments))
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),

@@ -310,7 +310,7 @@ class Vial:
         return self.spectrometer.counts(at, exposure_s, float(self.plant.apparent_od[0]), moving)
 
     def fluorescence(self, at: float) -> float:
-        """One reading of the fluorescent band, whole counts; nan where the plant has no second species."""
+        """One reading of the fluorescent band, whole counts; nan where nothing in it gives light."""
         self._nearly_sync(at)
         return float(np.round(self.plant.read_fluorescence()[0]))
 

@@ -177,9 +177,12 @@ class Doses:
                 pin = pumps.pins[self._job]
                 found, there = Request(self._job, 0.0, dose, now, pin.ran_s), pin.on or pumps.box.live(self._job)
                 asked = found._replace(ml=asked_ml, asked_s=now - ago_s, task=history.task)
-                seen = yield from pumps.follow(asked) if there else pumps.end(found)
-                end = seen.end if seen.high > 0.0 else None  # or it was over before: that it is not seen says nothing
-                media = seen._replace(low=0.0, high=max(seen.high, asked_ml), end=end or unseen)
+                if lost := pumps.box.state(self._job).word == "lost":  # its pin may be on since, and nobody told it
+                    pin.inits.append(asked.asked_s)  # no later word is that of its own process
+                seen = yield from pumps.follow(asked) if there else pumps.end(asked if lost else found)
+                media = seen._replace(
+                    low=0.0, high=max(seen.high, asked_ml), end=(seen.end if seen.high else None) or unseen
+                )
         self._conclude(plan, dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:

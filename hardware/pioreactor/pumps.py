@@ -443,7 +443,7 @@ class ForcedEnd:
         """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pins[self._job], self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
-        longest = max(min(off_s, self._still_s) - self._from_s, 0.0) * flow
+        longest = min(max(min(off_s, self._still_s) - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
         if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
             ran = longest

@@ -117,7 +117,7 @@ class SafetyConfig:
 
     def __post_init__(self) -> None:
         check(self, "safety")
-        low, high = self.composition_low, self.composition_high
+        low, high = self.targets
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
     def response(self, fault: Fault | type[Fault]) -> Response:
@@ -127,6 +127,11 @@ class SafetyConfig:
     def ml_a_minute(self, bench: Bench) -> float:
         """Feed budget of a minute, mL."""
         return 2.5 * (bench.max_rate * bench.period_s) if self.ml_per_minute is None else self.ml_per_minute
+
+    @property
+    def targets(self) -> tuple[float, float]:
+        """Lowest and highest target of the thermostat that a signal may set, degC."""
+        return self.composition_low, self.composition_high
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
         """Ages of a newest sample that is stale and that is lost, s.

@@ -143,7 +143,7 @@ class Interlock:
         if actuator.pump:
             low, high = 0.0, self.bench.max_rate
         elif actuator == THERMOSTAT:
-            low, high = self.config.composition_low, self.config.composition_high
+            low, high = self.config.targets
         asked = np.asarray(asked, dtype=np.float64)
         allowed = np.clip(asked, low, high)
         seen = {"actuator": actuator.name, "asked": asked, "unit": actuator.unit, "low": low, "high": high}

@@ -78,7 +78,7 @@ class ControllerLostFault(Fault, says="{count:.0f} unusable proposals in a row",
     remedy="replace the policy, then start a new run", response="regulate"):
     """And that several times in a row: the device holds the last setpoint."""
 class CommandLimitFault(Fault, says="{actuator}: {asked:.4g} {unit} asked, allowed {low:g} to {high:g}",
-    remedy="nothing if the controller asked too much; else set safety.composition_low and composition_high",
+    remedy="nothing if the controller asked too much; else set the limits of safety",
     response="report"):
     """A temperature or another command was out of range: cut."""
 class FluorescenceFault(Fault, says="{counts:.0f} counts, the same in {samples:.0f} samples",
@@ -86,7 +86,7 @@ class FluorescenceFault(Fault, says="{counts:.0f} counts, the same in {samples:.
     """No culture reads so, or no reading at all (nan); not shown to the controller."""
 class FluorescenceLostFault(Fault, says="no reading to believe for {minutes:.0f} min, now {counts:.0f} counts",
     remedy="check LED and spectrometer, then look at the device's FP slot", response="report"):
-    """The model alone carries the share on."""
+    """What it tells is not seen; a model alone carries that on."""
 
 
 PAUSES = (NoDilutionPause, FallsPause)

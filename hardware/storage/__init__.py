@@ -1,3 +1,3 @@
-"""What must survive a power cut: journal, recordings, atomic files; and reading recordings of others.
+"""What must survive a power cut: journal, recordings, atomic files.
 
-Entered by the record of a run, by resume, by calibrate, and by whatever writes a file that must be whole."""
+Entered by the record of a run, by resume, and by whatever writes a file that must be whole."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hardware.storage.recording_reader import read_recording
+from experiments.recordings.reader import read_recording
 from tests.campaigns.soak import Day, SoakConfig, soak, soak_run
 
 

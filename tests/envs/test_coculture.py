@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, limits, logit, passed, share
-from experiments.training.coculture import Coculture
+from experiments.coculture.task import Coculture
 from experiments.training.evaluation import Evaluation
 from tests.two_species import EQUAL_RATES_C, p_putida_rate
 

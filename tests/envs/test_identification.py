@@ -14,7 +14,7 @@ from envs.identification.open_loop import OpenLoop, open_loop, recordings
 from envs.identification.screening import Screened, Series, noise_sd, pumped_volume, screen
 from envs.identification.window import choose_window, longest
 from envs.integrators import rk4
-from hardware.storage.recording_reader import read_recording
+from experiments.recordings.reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 pytestmark = pytest.mark.numeric

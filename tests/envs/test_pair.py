@@ -8,8 +8,9 @@ import pytest
 
 from envs.coculture.optimum import Grid, cost_to_go, transitions
 from envs.coculture.pair import PairConfig, SpeciesConfig, named_pair
+from envs.coculture.second import of_pair
 from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, limits
-from envs.plant.plant import Plant, PlantConfig, of_pair
+from envs.plant.plant import Plant, PlantConfig
 from tests.envs.test_plant import preset
 
 pytestmark = pytest.mark.numeric

@@ -7,10 +7,10 @@ import pytest
 
 from conf.presets import load
 from conf.schema import build
+from envs.coculture.fluorescence import FluorescenceConfig
+from envs.coculture.second import SecondSpeciesConfig
 from envs.plant.culture import GrowthConfig
-from envs.plant.fluorescence import FluorescenceConfig
 from envs.plant.plant import Plant, PlantConfig
-from envs.plant.species import SecondSpeciesConfig
 from envs.plant.thermal import ThermalConfig
 from envs.plant.vessel import VesselConfig
 from tests.two_species import p_putida_rate, steady_production

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from envs.coculture.task import logit, share
-from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
+from experiments.coculture.base import Array, Mask, ShareEstimate, Wanted
 from tests.two_species import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 
 

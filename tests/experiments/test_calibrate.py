@@ -26,10 +26,11 @@ from experiments.calibration.result import environment_yaml, report, summary
 from experiments.calibration.study import against_truth, simulated
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
+from experiments.recordings import config as source
+from experiments.recordings.reader import Recording, read_recording
 from experiments.reporting import calibration_charts, charts, tensorboard
 from experiments.reporting.verdict import verdict
 from hardware.errors import RecordingError
-from hardware.storage.recording_reader import Recording, read_recording
 from tests.real_recording import DITHER, needs_dither
 
 pytestmark = pytest.mark.numeric
@@ -414,12 +415,13 @@ def test_what_is_read_of_a_file_is_what_was_asked_for(rows, given, tmp_path, mon
         asked.update(words, path=path)
         raise RecordingError("enough")
 
-    monkeypatch.setattr(command, "read_recording", read)
+    monkeypatch.setattr(source, "read_recording", read)
     config = CalibrateConfig(data="a.csv", rows=rows, run=2, reactor="M3", pump_ml_s=0.02, pumps=(1, 3))
     with pytest.raises(frame.UserError, match="^enough$"):
         command.body(config, tmp_path)
     assert asked == {
-        "path": "a.csv", "rows": given, "run": 2, "reactor": "M3", "pump_ml_s": 0.02, "pumps": (1, 3)
+        "path": "a.csv", "rows": given, "run": 2, "reactor": "M3", "pump_ml_s": 0.02, "pumps": (1, 3),
+        "doses": None, "columns": {}, "time_unit": None,
     }  # fmt: skip
 
 

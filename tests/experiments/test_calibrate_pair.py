@@ -9,14 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 from envs.coculture.pair import PairConfig, PigmentConfig, SpeciesConfig, named_pair
+from envs.coculture.second import of_pair
 from envs.identification import curves
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
-from envs.plant.plant import Plant, of_pair
+from envs.plant.plant import Plant
 from experiments import calibrate_pair as command
 from experiments.calibrate_pair import CalibratePairConfig, _growth, _pigment, _plateaus, _say, calibrate_pair
 from experiments.cli import frame
-from experiments.reporting import charts, composition_charts
+from experiments.coculture import charts as composition_charts
+from experiments.reporting import charts
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
 

@@ -356,7 +356,7 @@ def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
     assert settings(laws.law()) == {}
     assert set(settings(laws.share_law())) == {
         *(f"{prefix}estimator.{key}" for prefix in ("", "fallback.") for key in asdict(EstimatorConfig())),
-        *(f"fallback.{key}" for key in ("law", "watched_sd")),
+        *(f"fallback.{key}" for key in ("law", "watched_sd", "louder")),
         *(f"filter.{key}" for key in filters.fixed()),
     }
 

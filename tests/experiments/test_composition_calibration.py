@@ -9,8 +9,8 @@ from conf import presets
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
+from experiments.coculture.calibration import calibrate_sensor
 from experiments.laws import registry
-from experiments.laws.share.calibration import calibrate_sensor
 from tests.two_species import p_putida_rate, steady_production
 
 pytestmark = pytest.mark.numeric

@@ -13,12 +13,13 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import benchmark
 from experiments.cli import frame
-from experiments.comparison import statistics, studies
+from experiments.coculture import comparison
+from experiments.coculture.comparison import ShareCell, ShareTrial, calibrate, policies_of, with_pair
+from experiments.coculture.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from experiments.coculture.policies import SHIPPED_COMPOSITION
+from experiments.comparison import statistics
 from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.run import policies_of, with_pair
-from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
-from experiments.control.policies import SHIPPED_COMPOSITION
-from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from experiments.comparison.trials import cells, run_cell
 from experiments.loop.loop import ClosedLoop
 from tests.experiments.test_benchmark import load
 from tests.experiments.test_deploy import inverse_policy
@@ -39,7 +40,7 @@ def config() -> BenchmarkConfig:
 
 
 def cell(law, plant="coculture", announced=True, calibrated=True):
-    return Cell(law, plant, "ratio_steps", "share", "inverse", announced, calibrated)
+    return ShareCell(law, plant, "ratio_steps", "share", "inverse", announced, calibrated)
 
 
 @cache
@@ -82,9 +83,9 @@ def test_the_last_two_hours_are_those_of_every_window():
     share = setpoint + np.select([(minute >= a) & (minute < b) for a, b in late], [0.01, 0.03, 0.05], 0.2)
     t = replace(made_up([[0.0]]), schedule=phases(300.0, 300.0, 90.0, 300.0), minute=minute, setpoint=setpoint)
     t = replace(t, share=share[None])
-    assert statistics.last_hours(t)[0] == pytest.approx((120 * 0.01 + 90 * 0.03 + 120 * 0.05) / 330)
+    assert comparison.last_hours(t)[0] == pytest.approx((120 * 0.01 + 90 * 0.03 + 120 * 0.05) / 330)
     wave = replace(t, setpoint=0.5 + 0.1 * np.sin(minute))
-    assert math.isnan(statistics.last_hours(wave)[0])
+    assert math.isnan(comparison.last_hours(wave)[0])
 
 
 def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
@@ -92,9 +93,9 @@ def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
     share = np.where(minute >= 3000 - 1440, 0.51, 0.7)[None]
     t = made_up([[0.0]], setpoint=np.full(3000, 0.5))
     t = replace(t, schedule=phases(3000.0), minute=minute, share=share, estimate=share, low=share, high=share)
-    assert statistics.share_row(t)["ratio_abs_error_last_day"] == pytest.approx(0.01)
+    assert comparison.share_row(t)["ratio_abs_error_last_day"] == pytest.approx(0.01)
     short = {key: getattr(t, key)[..., :2800] for key in ("minute", "share", "setpoint", "estimate", "low", "high")}
-    assert math.isnan(statistics.share_row(replace(t, **short))["ratio_abs_error_last_day"])
+    assert math.isnan(comparison.share_row(replace(t, **short))["ratio_abs_error_last_day"])
 
 
 def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
@@ -113,10 +114,10 @@ def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_se
     for k, (density, calibrated) in enumerate(kinds):
         for law, off, announced in (("proportional", 0.1, False), ("pi", 0.1 * (k + 2), True)):
             one = made_up([[0.9, 0.5 + off, 0.5 + off, 0.4 + off], [0.9, 0.5 + off, 0.5 + off, 0.4 + off]], law=law)
-            trials.append(replace(one, cell=Cell(law, "coculture", "s", "share", density, announced, calibrated)))
+            trials.append(replace(one, cell=ShareCell(law, "coculture", "s", "share", density, announced, calibrated)))
     found = {(p["density"], p["calibrated"]): p["difference"] for p in statistics.pairs(trials, "pi")}
     assert found == pytest.approx({kind: -0.1 * (k + 1) for k, kind in enumerate(kinds)})
-    elsewhere = [replace(t, cell=t.cell._replace(plant="other")) for t in trials if t.cell.controller == "pi"]
+    elsewhere = [replace(t, cell=replace(t.cell, plant="other")) for t in trials if t.cell.controller == "pi"]
     assert statistics.pairs([t for t in trials if t.cell.controller != "pi"] + elsewhere, "pi") == []
 
 
@@ -146,7 +147,7 @@ def test_a_policy_that_is_named_holds_the_density_beside_a_share(tmp_path):
     worth = np.array([1e3, *given.biases[1][1:]], dtype=np.float32)
     policy.save(tmp_path / "mine.npz", replace(given, biases=(given.biases[0], worth)))
     mine = replace(config(), policies={"dqn": str(tmp_path / "mine.npz")})
-    at = cell("proportional")._replace(density="dqn")
+    at = replace(cell("proportional"), density="dqn")
     ours, shipped = run_cell(mine, at, None), run_cell(config(), at, None)
     assert (np.diff(ours.od, axis=1) > 0.0).all()
     assert ours.od[:, -1].min() > 1.5
@@ -223,7 +224,7 @@ def test_a_row_of_a_share_tells_root_mean_square_cover_and_densities_of_all_its_
     low, high = t.low.copy(), t.high.copy()
     low[0, 1], high[1, 2:] = 0.7, 0.3
     od = np.array([[0.4, 0.5, 0.6, 0.5], [0.5, 0.5, 0.5, 0.9]])
-    row = statistics.share_row(replace(t, estimate=t.share + off, low=low, high=high, od=od))
+    row = comparison.share_row(replace(t, estimate=t.share + off, low=low, high=high, od=od))
     assert row["n"] == 2
     assert row["estimate_rms"] == pytest.approx(math.sqrt((0.09 + 0.01) / 8.0))
     assert row["band_covers"] == pytest.approx(5.0 / 8.0)
@@ -289,9 +290,11 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
         for plant in plants:
             for law in laws:
                 found = made_up(share, law=law)
-                found = replace(found, cell=Cell(law, plant, scenario, "share", "inverse"), foresight=law == "optimum")
+                found = replace(
+                    found, cell=ShareCell(law, plant, scenario, "share", "inverse"), foresight=law == "optimum"
+                )
                 trials.append(replace(found, temperature=np.full((2, 4), 30.0 + len(trials))))
-    drawn = {d.name: d for d in studies._shares(trials, statistics.rows(trials))}
+    drawn = {d.name: d for d in comparison._drawn(trials, statistics.rows(trials))}
     assert {name: d.title for name, d in drawn.items()} == {
         "composition_steps_laws": "steps: every law and plant", "composition_steps_shares": "steps: shares on one",
         "composition_sine_laws": "sine: every law and plant", "composition_sine_shares": "sine: shares on two",

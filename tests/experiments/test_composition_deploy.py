@@ -13,13 +13,14 @@ import yaml
 
 from experiments import report
 from experiments.cli import frame
-from experiments.cli.calibrated import read_pair
+from experiments.coculture.config import read_pair
+from experiments.coculture.policies import SHIPPED_COMPOSITION
+from experiments.coculture.signal import COLUMNS
 from experiments.control import assemble, policies, run
 from experiments.deploy import main
 from experiments.loop.metrics import mean_errors
-from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
-from hardware.storage.recording_reader import read_recording
+from experiments.recordings.reader import read_recording
 
 F = TypeVar("F", bound=Callable[..., Any])
 WORDS = ("plant=coculture", "scenario=ratio_steps", "composition=proportional", "fsync=false")
@@ -194,7 +195,7 @@ def test_what_does_not_fit_is_refused_with_the_remedy(words: str, said: str, tmp
 
 
 def test_a_learned_controller_without_a_policy_that_ships_says_what_to_give(tmp_path, monkeypatch):
-    monkeypatch.setitem(policies.SHIPPED_COMPOSITION, "dqn", tmp_path / "none.npz")
+    monkeypatch.setitem(SHIPPED_COMPOSITION, "dqn", tmp_path / "none.npz")
     with pytest.raises(frame.UserError, match="composition=dqn: no policy for it comes with this version; give compos"):
         deploy(tmp_path / "run", *WORDS[:2], "composition=dqn")
 

@@ -17,10 +17,11 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
+from experiments.coculture.base import SHARE
+from experiments.coculture.signal import Share
 from experiments.control import assemble
 from experiments.control.run import BenchMarks
 from experiments.laws import registry
-from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig
@@ -43,7 +44,7 @@ TWO = DeviceOptions(vial=VialConfig(outlier_rate=0.0), plant=PLANT)
 def rehearsal(
     folder: Path, scenario: Scenario, names: tuple[str, ...] = ("M0",), kind: str = "proportional"
 ) -> Rehearsal:
-    config = replace(rehearsed(names, scenario), composition=registry.config(kind, registry.SHARE))
+    config = replace(rehearsed(names, scenario), composition=registry.config(kind, SHARE))
     return Rehearsal(folder, config, TWO, seed=1)
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.trials import Cell, run_cell
-from experiments.laws.share.estimator import (
+from experiments.coculture.comparison import ShareCell
+from experiments.coculture.estimator import (
     BIAS_E,
     BIAS_P,
     FACTOR,
@@ -23,6 +22,8 @@ from experiments.laws.share.estimator import (
     CompositionEstimator,
     CompositionEstimatorConfig,
 )
+from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.trials import run_cell
 from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 
 pytestmark = pytest.mark.numeric
@@ -108,7 +109,7 @@ def closed_loop(plant, calibrated):
     scenarios = {"steps": schedule}
     benchmark = frame.load(frame.compose("benchmark", ["replicates=32"]), BenchmarkConfig())
     config = replace(benchmark, scenarios=scenarios)
-    return run_cell(config, Cell("proportional", plant, "steps", "share", "inverse", False, calibrated), None)
+    return run_cell(config, ShareCell("proportional", plant, "steps", "share", "inverse", False, calibrated), None)
 
 
 @pytest.mark.slow

@@ -6,14 +6,15 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from dqn.policy import Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
+from experiments.coculture import planned
+from experiments.coculture.base import SEEN as COCULTURE
+from experiments.coculture.base import SEEN_AHEAD as COCULTURE_PREVIEW
+from experiments.coculture.base import SHARE, ShareEstimate, Wanted
+from experiments.coculture.program import Program
 from experiments.laws import registry
-from experiments.laws.registry import SHARE
-from experiments.laws.share import planned
-from experiments.laws.share.base import ShareEstimate, Wanted
-from experiments.laws.share.program import Program
 from hardware import memory
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 

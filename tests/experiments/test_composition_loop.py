@@ -11,14 +11,15 @@ import pytest
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.coculture.base import SHARE, Array, Mask, ShareEstimate, Wanted
+from experiments.coculture.charts import composition_figure_of
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.signal import COLUMNS, Share, ShareWarnings
 from experiments.laws import registry
-from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
-from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
-from experiments.loop.share import COLUMNS, Share, ShareWarnings
 from experiments.loop.signals import Sample, Signal
 from experiments.record.record import Recordings
-from experiments.record.summary import composition_figure_of, figure_of
+from experiments.record.summary import figure_of
 from hardware.actuator import THERMOSTAT
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
@@ -345,8 +346,8 @@ LENGTH, CUT = 110, 55
 def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> None:
     def fresh(reactors: SimulatedReactors) -> ClosedLoop:
         limits = ShareWarnings(wide=0.01, wide_h=0.5)
-        config = registry.config(kind, registry.SHARE)
-        law = registry.build(config, registry.SHARE)
+        config = registry.config(kind, SHARE)
+        law = registry.build(config, SHARE)
         return loop(reactors, CompositionEstimator(config.estimator), SCHEDULE, limits, law)
 
     def told(steps: list[Step]) -> list[Any]:

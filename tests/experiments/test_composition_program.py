@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.laws.share.program import Program
+from experiments.coculture.program import Program
 
 NAN = float("nan")
 STEPS = Program((NAN, 0.3, 0.7, 0.7, 0.3, NAN, 0.5), (60.0, 360.0, 300.0, 300.0, 60.0, 60.0, 60.0))

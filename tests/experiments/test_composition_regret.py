@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from envs.coculture.task import CocultureConfig
-from experiments.training.coculture import Coculture
+from experiments.coculture.task import Coculture
 from experiments.training.evaluation import Evaluation
 from tests.studies.learners import one_line, receding
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.laws import registry
-from experiments.laws.share import recall
-from experiments.laws.share.estimator import (
+from experiments.coculture import recall
+from experiments.coculture.base import SHARE
+from experiments.coculture.estimator import (
     FACTOR,
     GAIN,
     LOGIT,
@@ -17,8 +17,9 @@ from experiments.laws.share.estimator import (
     CompositionEstimator,
     CompositionEstimatorConfig,
 )
-from experiments.laws.share.recall import Recall
-from experiments.loop.share import Share
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import Share
+from experiments.laws import registry
 from hardware import memory
 
 CONFIG = CompositionEstimatorConfig(starts=1)
@@ -172,7 +173,7 @@ def test_a_resumed_run_that_is_told_its_past_is_one_that_was_not_interrupted(hou
                 cells = (minute, *(float(a[n]) for a in arguments[:3]), 1.0, NAN)
                 for key, value in zip(keys, cells, strict=True):
                     rows[n][key].append(value)
-    law = registry.build(registry.config("proportional", registry.SHARE), registry.SHARE)
+    law = registry.build(registry.config("proportional", SHARE), SHARE)
     scenario = Scenario((0.5,), (100.0,), (33.2,), ratios=(0.4,))
     share = Share(Recall(CompositionEstimator(CONFIG)), law, [scenario, scenario])
     share.estimator = again

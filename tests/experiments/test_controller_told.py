@@ -357,7 +357,7 @@ def test_a_spare_pump_s_dose_is_as_large_as_the_bench_allows_in_a_period() -> No
 
 def test_the_second_filter_s_alarm_is_said_of_the_culture_that_is_steered_and_believed() -> None:
     law = Shown()
-    law.explain = lambda: {"alarm": np.ones(4), "error": np.zeros(4)}  # type: ignore[attr-defined]
+    law.explain = lambda: {"alarm": np.array([1, 1, 1, 0]), "noted": np.ones(4)}  # type: ignore[attr-defined]
     rows, nan = np.ones(4, dtype=bool), np.full(4, np.nan)
     believed, phase = np.array([True, True, False, True]), np.array([-1, 0, 0, 2])
     m = Measurement(np.zeros(4), nan, nan, rows)

@@ -13,6 +13,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
+from experiments.coculture.base import SHARE
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Accounts, Array, Controller, Explains, Watches
@@ -32,7 +33,7 @@ from tests.experiments import laws
 pytestmark = pytest.mark.numeric
 
 MODEL = EnvConfig()
-KINDS = tuple(registry.KINDS[registry.DENSITY])
+KINDS = tuple(registry.KINDS)
 GIVEN = {
     "mpc": MpcConfig(swarm=SwarmConfig(particles=6, iterations=8)),
     "threshold": ThresholdConfig(hysteresis=0.02),
@@ -209,7 +210,7 @@ def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
         registry.on_device("oracle")
     taken = {part: [kind for kind in KINDS if registry.takes(kind, part)] for part in ("volume_ml", "policy")}
     assert taken == {"volume_ml": ["pi"], "policy": ["dqn"]}
-    assert not registry.takes("pi", "policy", registry.SHARE)
+    assert not registry.takes("pi", "policy", SHARE)
     with pytest.raises(ValueError, match="law mine: no part models"):
         registry.add("mine", HoldConfig, Hold, "of no use", ["model", "models"])
     with pytest.raises(ValueError, match=r"controller\.kind = mine"):

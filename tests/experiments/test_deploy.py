@@ -29,6 +29,7 @@ from experiments.laws import registry
 from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
 from experiments.record.curves import Curves
+from experiments.recordings.reader import read_recording
 from hardware.chibio.messages import Absent
 from hardware.errors import DeviceStateError
 from hardware.family import family_of
@@ -38,7 +39,6 @@ from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
-from hardware.storage.recording_reader import read_recording
 from tests import programs
 from tests.hardware.driver_lab import DriverLab
 

@@ -28,7 +28,7 @@ from experiments.cli import frame
 from experiments.control import run
 from experiments.control.config import DeployConfig
 from experiments.laws import registry
-from experiments.laws.registry import DENSITY, KINDS
+from experiments.laws.registry import KINDS
 from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
@@ -114,13 +114,13 @@ def check(folder: Path, kind: str) -> None:
         assert not {tag for tag in tags if "plan" in tag or "predicted" in tag}
 
 
-@pytest.mark.parametrize("kind", KINDS[DENSITY])
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_controller_on_simulated_vials(kind: str, tmp_path: Path) -> None:
     run.deploy(config(kind, "sim", tmp_path), tmp_path)
     check(tmp_path, kind)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS[DENSITY] if kind != "oracle"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "oracle"])
 def test_every_controller_on_the_emulated_device(kind: str, tmp_path: Path, emulated: list[ChiBioDevice]) -> None:
     run.deploy(config(kind, "emulator", tmp_path), tmp_path)
     check(tmp_path, kind)

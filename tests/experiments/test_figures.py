@@ -31,13 +31,16 @@ from envs.task import EnvConfig
 from experiments.certification.config import CertifyConfig
 from experiments.certification.figure import figure as certificate_figure
 from experiments.certification.judge import Certificate, certify
+from experiments.coculture import charts as composition_charts
+from experiments.coculture import comparison
+from experiments.coculture.charts import composition_figure_of, pair_figure
+from experiments.coculture.comparison import ShareCell, ShareTrial
 from experiments.comparison import figures
-from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
+from experiments.comparison.trials import Cell, DensityTrial
 from experiments.record.record import Recordings
-from experiments.record.summary import composition_figure_of, figure_of
-from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
+from experiments.record.summary import figure_of
+from experiments.reporting import calibration_charts, charts, sweep_charts
 from experiments.reporting.calibration_charts import agreement_figure
-from experiments.reporting.composition_charts import pair_figure
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 
@@ -188,7 +191,7 @@ def share_trial() -> ShareTrial:
     minute, spread = np.arange(121.0), np.linspace(0.0, 1.0, 101)[:, None]
     share, warm = 0.2 + 0.2 * spread + 0.0 * minute, 30.0 + 2.0 * spread + 0.0 * minute
     nothing = np.zeros_like(share)
-    cell = Cell("pi", "p", "s", "share")
+    cell = ShareCell("pi", "p", "s")
     return ShareTrial(
         cell, SCENARIO, minute, warm, False, np.full(121, 0.35), share, nothing, nothing, nothing, nothing
     )
@@ -398,7 +401,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (1, "line 0", H, PUMP, TENS / 60, np.full(40, 8.0)),
         (2, "line 1", H, "vial, °C", [200 / 60] * 2, [0.0, 1.0]),
     ]),
-    "shares": (lambda: figures.shares([share_trial()]), [
+    "shares": (lambda: comparison.shares([share_trial()]), [
         (0, "line 0", "hours", "share of the second species", np.arange(0, 121, 5) / 60, np.full(25, 0.3)),
         (0, "band 0", "hours", "share of the second species", np.arange(0, 121, 5) / 60, [[0.21] * 25, [0.39] * 25]),
         (0, "line 1", "hours", "share of the second species", np.arange(0, 121, 5) / 60, np.full(25, 0.35)),
@@ -419,7 +422,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (0, "row -45 -25", "ISE minus that of dqn, %", "", -40.0, 0.0),
         (1, "row 20 40", "ITAE minus that of dqn, %", "", 25.0, 0.0),
     ]),
-    "errors of a share": (lambda: figures.share_errors(
+    "errors of a share": (lambda: comparison.share_errors(
         [{"controller": "pi", "plant": "p", "ratio_abs_error_mean": 0.1, "ci95": [0.09, 0.13]}]), [
         (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
     ]),
@@ -609,9 +612,9 @@ def test_a_long_run_is_drawn_by_the_means_of_its_blocks() -> None:
 
 def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
     one = share_trial()
-    told = replace(one, cell=Cell("midpoint", "p", "s", "share"), foresight=True, share=one.share + 0.3)
+    told = replace(one, cell=ShareCell("midpoint", "p", "s"), foresight=True, share=one.share + 0.3)
     told = replace(told, temperature=one.temperature + 2.0, setpoint=one.setpoint + 0.3)
-    axes = figures.shares([told, one]).axes
+    axes = comparison.shares([told, one]).axes
     assert [ax.get_title() for ax in axes] == ["midpoint, told ahead", "pi", "", ""]
     assert [float(ax.lines[0].get_ydata()[0]) for ax in axes] == pytest.approx([0.6, 0.3, 33.0, 31.0])
     assert [float(ax.lines[1].get_ydata()[0]) for ax in axes[:2]] == pytest.approx([0.65, 0.35])
@@ -627,7 +630,7 @@ def test_errors_of_a_share_have_the_mark_of_their_law_in_the_row_of_their_plant(
         for k, (law, told) in enumerate(laws_of)
         if (i, k) != (1, 1)
     ]  # fmt: skip
-    drawn = figures.share_errors(entries)
+    drawn = comparison.share_errors(entries)
     (ax,) = drawn.axes
     assert [text.get_text() for text in ax.get_yticklabels()] == ["wide", "narrow"]
     marks = legend(drawn)

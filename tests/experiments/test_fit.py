@@ -17,13 +17,14 @@ from envs.plant.pump import PumpConfig
 from envs.plant.vessel import VesselConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
+from experiments.coculture.base import SHARE
+from experiments.coculture.signal import Share, ShareWarnings
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.control.messages import CannotResume, PlantIgnored
 from experiments.deploy import main
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
-from experiments.loop.share import Share, ShareWarnings
 from experiments.record.record import Record
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
@@ -109,7 +110,7 @@ PI = registry.config("pi")
 TWO = DeployConfig(backend=SimulatedConfig(reactors=("M0", "M1")), controller=PI)
 DEVICE = replace(TWO, backend=ChiBioConfig(reactors=("M0", "M1")))
 STEPS = Scenario((0.5,) * 4, (60.0, 360.0, 600.0, 600.0), (None,) * 4, ratios=(None, 0.3, 0.7, 0.3))
-SHARES: dict[str, Any] = {"scenario": STEPS, "composition": registry.config("pi", registry.SHARE)}
+SHARES: dict[str, Any] = {"scenario": STEPS, "composition": registry.config("pi", SHARE)}
 
 
 def test_what_differs_for_one_reactor_differs_for_no_other() -> None:
@@ -187,7 +188,7 @@ def test_a_share_is_estimated_with_each_vial_s_volume_and_the_settings_of_the_ru
     assert isinstance(share, Share)
     filter_ = share.estimator.estimator  # type: ignore[attr-defined]
     assert np.ravel(filter_._volume_ml).tolist() == [16.0, 12.0]
-    assert (filter_.pair.second.name, setup.species) == ("P. syringae", "P. syringae")
+    assert (filter_.pair.second.name, share.species) == ("P. syringae", "P. syringae")
     assert filter_.config.od_term == 90.0
     assert share.warnings == warns
     assert [s.announce_min for s in share.schedules] == [90.0, 45.0]

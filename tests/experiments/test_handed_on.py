@@ -14,8 +14,8 @@ import pytest
 from envs.coculture.pair import named_pair
 from envs.coculture.task import SCALES, CocultureConfig
 from experiments.cli import extensions, files, frame, latest, start
-from experiments.cli.calibrated import read_curves
 from experiments.cli.help_page import shown
+from experiments.coculture.config import read_curves
 
 
 def refused(constant: str) -> None:

@@ -16,10 +16,13 @@ from envs.task import EnvConfig
 from experiments import demo
 from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, worst
 from experiments.cli.frame import UserError
+from experiments.coculture import policies as share_policies
+from experiments.coculture.policies import KEPT as COMPOSITION_POLICY
+from experiments.coculture.policies import composition_policy
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
 from experiments.control.messages import OtherPeriod, PumpsTooMuch
-from experiments.control.policies import COMPOSITION_POLICY, composition_policy, find_policy, load_policy
+from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
@@ -124,9 +127,9 @@ def test_a_policy_that_pumps_faster_than_the_bench_allows_is_refused_with_both_r
 
 def test_a_share_s_policy_of_a_deployment_is_its_composition_policy(tmp_path: Path) -> None:
     """Any other folder is a training's; a deployment has the policy of its density as policy.npz."""
-    assert policies._share_policy(str(tmp_path)) == tmp_path / "policy.npz"
+    assert share_policies._found(str(tmp_path)) == tmp_path / "policy.npz"
     (tmp_path / "journal.jsonl").touch()
-    assert policies._share_policy(str(tmp_path)) == tmp_path / COMPOSITION_POLICY
+    assert share_policies._found(str(tmp_path)) == tmp_path / COMPOSITION_POLICY
 
 
 def test_each_learned_law_of_a_share_has_a_policy_of_its_own_that_ships(tmp_path: Path) -> None:

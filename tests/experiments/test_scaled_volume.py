@@ -35,7 +35,7 @@ def decisions(folder: Path, law: str, scale: float) -> tuple[Any, Any, list[list
     return np.array([step.od for step in steps]), np.array([step.rate for step in steps]) / scale, kinds
 
 
-LAWS = [kind for kind in registry.KINDS[registry.DENSITY] if not registry.takes(kind, "volume_ml")]
+LAWS = [kind for kind in registry.KINDS if not registry.takes(kind, "volume_ml")]
 """All but the device's own, whose integral gains are of a vial of 20 mL and a pump of 1 mL/s."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
+from experiments.coculture.program import composed
 from experiments.comparison.config import BenchmarkConfig
 from experiments.loop.progress import Progress
 from experiments.record.summary import summarise
@@ -99,7 +100,7 @@ def test_conditions_do_not_go_with_shares_and_need_one_for_each_step() -> None:
         Scenario(until=("settled",), ratios=(0.3,))
     with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed none or one for each of the 1 phases"):
         Scenario(until=("settled", None))
-    assert Scenario(until=(None,), ratios=(0.3,)).composed
+    assert composed(Scenario(until=(None,), ratios=(0.3,)))
 
 
 def _run(folder: Path, schedule: Scenario = GROWS, **each: object) -> Rehearsal:

@@ -10,11 +10,11 @@ import pytest
 from conf.messages import NameTaken
 from envs.scenario import Scenario
 from experiments.cli import frame
+from experiments.coculture.signal import COLUMNS
 from experiments.control import run
 from experiments.control.assemble import unpack
 from experiments.deploy import main
 from experiments.loop import signals
-from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
 from experiments.training import agents, tasks
 from hardware.actuator import THERMOSTAT

@@ -159,17 +159,17 @@ def test_a_filter_is_set_by_the_policy_s_file_then_by_the_command_and_the_second
     assert (made.policy, made.bounds) == (given, BOUNDS)
 
 
-def test_without_a_certificate_no_bounds_supervise_and_surprises_do() -> None:
+def test_without_a_certificate_no_bounds_supervise_and_what_surprises_both_filters_is_a_note() -> None:
     law = RelativeController(POLICY, EstimatorConfig(), MODEL, None)
     law.reset(1)
     law.act(np.array([0.5]), np.array([0.5]), np.zeros(1), np.ones(1, dtype=bool))
     in_doubt(law, 0, 1e3)
     law.act(np.array([np.nan]), np.array([0.5]), np.ones(1), np.ones(1, dtype=bool))
     assert law.explain()["supervised"].tolist() == [0.0]
-    for minute, od in enumerate((0.5, 0.9, 0.5, 0.9, 0.5, 0.9), 2):  # the doubt is gone with the first of them
+    for minute, od in enumerate((0.5, 0.9) * 5, 2):  # the doubt is gone with the first of them
         law.act(np.array([od]), np.array([0.5]), np.array([float(minute)]), np.ones(1, dtype=bool))
-    assert law.estimator.loudness[0] > 21.0
-    assert [law.explain()[key].tolist() for key in ("supervised", "alarm")] == [[1.0], [1.0]]
+    assert law.estimator.loudness[0] > 36.0
+    assert [law.explain()[key].tolist() for key in ("supervised", "alarm", "noted")] == [[0.0], [0.0], [1.0]]
 
 
 def surprised(filter_: Estimator, squares: list[float]) -> None:
@@ -191,6 +191,8 @@ def surprised(filter_: Estimator, squares: list[float]) -> None:
         ([0.1] * 39, [0.8] * 40, False),  # not yet long
         ([0.8] * 40, [0.1] * 40, False),
         ([0.8] * 40, [9.0] * 40, False),  # what the second one thinks of itself alarms nobody
+        ([9.0] * 40, [5.9] * 40, True),  # 90 > 1.5 * 59
+        ([9.0] * 40, [6.1] * 40, False),  # readings that surprise both say nothing of the first
     ],
 )
 def test_surprises_that_do_not_fit_raise_the_alarm(first: list[float], second: list[float], alarm: bool) -> None:
@@ -224,6 +226,7 @@ def test_the_law_of_the_supervisor_puts_the_next_sample_on_the_setpoint_whenever
         law.act(np.full(1, 0.5), np.full(1, 0.5), np.full(1, period * k), one)
         law.dosed(np.full(1, 20.0 * 0.025 * period))  # as much as grows
     surprised(law.estimator, [2.2] * 10)
+    surprised(law.second, [0.8] * 10)
     law.second.mean[0, LOG_OD] = np.log(0.506)
     rate = law.act(np.full(1, 0.5), np.full(1, 0.5), np.full(1, period * 19), one)
     assert law.explain()["supervised"].tolist() == [1.0]

@@ -28,11 +28,11 @@ from experiments.cli import frame
 from experiments.control import run as control
 from experiments.deploy import main as deploy
 from experiments.record.record import Record
+from experiments.recordings.reader import read_recording
 from experiments.reporting.curves import CURVES, METRICS, PARAMETERS, POPULATION, described
 from experiments.reporting.tensorboard import Events, PopulationWriter
 from experiments.train import main as train
 from experiments.training import run as training
-from hardware.storage.recording_reader import read_recording
 
 PAGE = Path(__file__).parents[2] / "docs" / "tensorboard.md"
 ROW = re.compile(r"^\| `(\w+/\w+)` \| (.*?) ?\|", re.MULTILINE)

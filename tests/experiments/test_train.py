@@ -23,6 +23,7 @@ from envs.coculture.optimum import Grid
 from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
+from experiments.coculture.base import SEEN, SEEN_AHEAD
 from experiments.train import main as entry_point
 from experiments.training import build
 from experiments.training import run as train_run
@@ -183,7 +184,7 @@ def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatc
 
     The optimum is found on a coarse grid of shares.
     """
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=41))
     drawn, save = {}, train_run.charts.save
 
     def kept(figure, folder, name):
@@ -195,7 +196,7 @@ def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatc
     train_run.train(entry_point.config([f"env={name}", *words]), tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     learned = policy.load(tmp_path / "policy.npz")
-    assert learned.observation == (policy.COCULTURE if name == "coculture" else policy.COCULTURE_PREVIEW)
+    assert learned.observation == (SEEN if name == "coculture" else SEEN_AHEAD)
     assert learned.actions.tolist() == np.linspace(29.0, 36.0, 17).tolist()
     assert learned.metadata["regret_pct"] == pytest.approx(summary["regret_pct"][0])
     assert (summary["myopic_regret_pct"] > 300.0) == (name == "coculture_preview")

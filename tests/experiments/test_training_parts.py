@@ -25,11 +25,12 @@ from envs.coculture.task import CocultureConfig, logit, share
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
+from experiments.coculture import config as two_species
+from experiments.coculture.task import Coculture
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.train import main as entry_point
 from experiments.training import announcements, build, tasks
 from experiments.training import run as train_run
-from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluation, Rollout, Score, each
@@ -409,11 +410,11 @@ def test_a_relative_policy_sees_the_edge_of_its_training_beyond_it() -> None:
 
 def test_the_share_that_is_drawn_as_asked_for_is_that_of_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Decision by decision, also at that in which the change comes."""
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=41))
     drawn: list[Any] = []
-    monkeypatch.setattr("experiments.reporting.composition_charts.episodes", lambda *given: drawn.append(given))
+    monkeypatch.setattr("experiments.coculture.charts.episodes", lambda *given: drawn.append(given))
     task = Coculture(CocultureConfig(preview_min=120.0, episode_steps=12, control_min=30.0))
-    monkeypatch.setattr("experiments.training.coculture.each", lambda _: lambda o: np.zeros(o.shape[:-1], dtype=int))
+    monkeypatch.setattr("experiments.coculture.task.each", lambda _: lambda o: np.zeros(o.shape[:-1], dtype=int))
     best = task.best
     monkeypatch.setattr(task, "best", lambda start: drawn.append(best(start)) or drawn[-1])
     task.figures(inverse_policy())
@@ -555,7 +556,7 @@ def test_grids_of_a_share_are_every_start_with_every_setpoint_at_rest() -> None:
 
 def test_the_optimum_of_many_programs_at_once_is_that_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty changes, which are more than are taken together, on a coarse grid of shares."""
-    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=21))
+    monkeypatch.setattr("experiments.coculture.task.FINE", Grid(logits=21))
     task = Coculture(CocultureConfig(n_actions=5, control_min=30.0, preview_min=60.0, episode_steps=3))
     start = task.report_grid()[:30][::-1]
     together = task.best(start)
@@ -692,7 +693,7 @@ def test_start_and_end_are_told_with_all_seeds_their_worst_and_the_command_that_
     kept, myopic = scored([0.1, 0.9, 0.2], [[0.001], [0.002], [0.02]]), scored([-7.0], [[0.3]])
     with caplog.at_level("INFO"):
         announcements.began(TrainConfig(env=task.config, agent=SMALL), task, range(5, 8), tmp_path, 40)
-        announcements.ended(tmp_path, task, kept, myopic, "spent", path, "pair.yaml")
+        announcements.ended(tmp_path, task, kept, myopic, "spent", path, "pair=pair.yaml")
     learns, good, where, spent, reached, compared, written, *following = caplog.messages
     for line, told in (
         (learns, ("coculture", "3 agents", "seeds 5 to 7", "step 40 of 100 steps")), (good, ("5 %", "0.02 ")),
@@ -727,8 +728,8 @@ def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_re
     """The curves by their file, the pair by its name; everything else of the task stays as it was asked for."""
     pair = replace(PairConfig(), second=replace(PairConfig().second, name="B. subtilis"))
     read = Mock(side_effect=lambda file, env: replace(env, scale_e=1.2))
-    monkeypatch.setattr(train_run, "read_curves", read)
-    monkeypatch.setattr(train_run, "read_pair", lambda name: {"bs.yaml": pair}[name])
+    monkeypatch.setattr(two_species, "read_curves", read)
+    monkeypatch.setattr(two_species, "read_pair", lambda name: {"bs.yaml": pair}[name])
     monkeypatch.setattr(train_run, "Session", Mock(side_effect=CheckpointError("far enough")))
     env = CocultureConfig(control_min=20.0)
     with pytest.raises(UserError, match="far enough"):
@@ -742,9 +743,11 @@ def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_re
         train_run.train(TrainConfig(env=env, env_file="run", agent=SMALL), tmp_path)
     kept = OmegaConf.load(tmp_path / "config.yaml")
     assert (kept.env_file, kept.env.scale_e, kept.env.pair.second.name) == (None, 1.2, "P. putida")
-    monkeypatch.setattr(train_run, "read_pair", Mock(side_effect=UserError("gone, or of another pair by now")))
+    monkeypatch.setattr(two_species, "read_pair", Mock(side_effect=UserError("gone, or of another pair by now")))
     with pytest.raises(UserError, match="far enough"):
         train_run.train(replace(config, resume="latest"), tmp_path)
     assert train_run.Session.call_args.args[0].env == config.env  # type: ignore[attr-defined]
-    with pytest.raises(UserError, match=r"pair=bs\.yaml: a task of one species; give env=coculture_preview beside it"):
-        train_run.train(TrainConfig(pair="bs.yaml", agent=SMALL), tmp_path)
+    with pytest.raises(
+        ValueError, match=r"pair = bs\.yaml: allowed null for a task of one species; give env=coculture"
+    ):
+        TrainConfig(pair="bs.yaml", agent=SMALL)

@@ -89,7 +89,7 @@ def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
 
 def test_a_deployment_of_two_species_says_its_error():
     """Three windows of unlike errors, in one of which no share was asked for."""
-    windows = [{**WINDOW, "ratio_abs_error_mean": error} for error in (0.02, None, 0.05)]
+    windows = [{**WINDOW, "ratio_setpoint": 0.5, "ratio_abs_error_mean": error} for error in (0.02, None, 0.05)]
     said = verdict(DEPLOYED | {"windows": windows}, LOOP)
     assert said.items[3:] == ["mean error of the share 0.035, as estimated"]
     short = [{**WINDOW, "steady_abs_error": None}]

@@ -95,6 +95,10 @@ class Ekf:
     sd = doubt
 
     @property
+    def loudness(self) -> Array:
+        return 10.0 * self._square
+
+    @property
     def loud(self) -> Mask:
         return np.asarray(self._square > FIXED["loud_mean_square"])
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.recordings.reader import read_recording
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
@@ -20,7 +21,6 @@ from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import RecordingError
 from hardware.link.transport import Reply, Transport
 from hardware.reactor import Command
-from hardware.storage.recording_reader import read_recording
 
 CASES = int(os.environ.get("FUZZ_CASES", "300"))
 STRANGE: tuple[Any, ...] = (None, "", "x", -1, 0, 1, 2, 1e308, float("nan"), float("inf"), True, [], {}, [[]], "M7")

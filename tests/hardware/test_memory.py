@@ -20,12 +20,14 @@ from dqn import policy as policies
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import files
-from experiments.control.policies import SHIPPED_COMPOSITION, load_policy
+from experiments.coculture.base import SHARE
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.policies import SHIPPED_COMPOSITION
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import Share
+from experiments.control.policies import load_policy
 from experiments.laws import registry
-from experiments.laws.share.estimator import CompositionEstimator
-from experiments.laws.share.recall import Recall
 from experiments.loop.loop import ClosedLoop
-from experiments.loop.share import Share
 from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 
@@ -69,8 +71,8 @@ def preview() -> Any:
 def unused(kind: str) -> ClosedLoop:
     """A loop in which everything that can remember does."""
     law = registry.build(registry.config(kind), model=EnvConfig(), policy=policy())
-    config = registry.config(LAWS[kind], registry.SHARE)
-    ratio = registry.build(config, registry.SHARE, policy=preview())
+    config = registry.config(LAWS[kind], SHARE)
+    ratio = registry.build(config, SHARE, policy=preview())
     share = Share(Recall(CompositionEstimator(config.estimator)), ratio, SCHEDULES)
     reactors: Any = SimpleNamespace(names=("M0", "M1"))
     ahead = 20.0 if kind == "pi_tuned" else None  # an estimator beside it

@@ -114,7 +114,9 @@ def test_each_dose_of_somebody_else_is_counted_once_as_what_it_is_and_holds_ours
     assert not lab.of("dose_end")
 
 
-def test_a_pump_that_a_lock_keeps_off_is_told_with_its_command_and_tried_again(lab):
+def test_a_pump_that_a_word_and_then_a_lock_of_before_keep_off_is_told_with_its_command_and_tried_again(lab):
+    lab.world.say("add_media/$state", "ready", retained=True)  # and its unit does not list it
+    lab.wait(60.0)
     lab.world.locks.add(MEDIA_PIN)  # as a full disk leaves it
     for told in ([], ["undosed"], []):
         lab.sample()
@@ -122,12 +124,6 @@ def test_a_pump_that_a_lock_keeps_off_is_told_with_its_command_and_tried_again(l
         lab.wait(8.0)
         assert [fault.kind for fault in [lab.fault] if fault and fault.fields["why"].fields["pin"] == MEDIA_PIN] == told
         lab.world.locks -= {MEDIA_PIN} if told else set()
-
-
-def test_a_retained_word_of_a_pump_that_its_unit_does_not_list_holds_doses_for_a_while_only(lab):
-    lab.world.say("add_media/$state", "ready", retained=True)
-    lab.wait(60.0)
-    assert lab.dose(0.5) == 0.5
 
 
 @pytest.mark.parametrize("retained", [False, True])
@@ -500,6 +496,17 @@ def test_after_a_crash_a_pump_that_cannot_be_proven_off_is_told_after_a_while(mo
         messages.BeingVerified, messages.MayRunOn
     ]  # fmt: skip
     assert messages.RunsOn not in seen
+
+
+def test_a_pump_that_was_killed_untold_is_booked_whole_by_a_run_that_is_resumed(lab, monkeypatch):
+    lab.world.kill_after_s, lab.world.unkept = 0.01, True
+    lab.dose(0.8)
+    lab.wait(5.0)
+    again = lab.resumed(monkeypatch, 10.0, lab.reactors.elapsed())
+    again.wait(60.0)
+    lab.world.locks.clear()
+    again.well()
+    again.check_given(LATE_ML)
 
 
 # -- a second fluid ----------------------------------------------------------------------------------------------------

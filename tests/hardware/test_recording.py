@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.recordings.reader import Recording, read_recording
 from hardware.errors import RecordingError
 from hardware.storage import messages
 from hardware.storage.marks import Mark, add_mark, read_marks
 from hardware.storage.recorder import Recorder
-from hardware.storage.recording_reader import Recording, read_recording
 from tests.real_recording import DITHER, needs_dither
 
 Read = Callable[..., Recording]

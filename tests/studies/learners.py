@@ -25,12 +25,12 @@ from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
 from experiments.cli import files
 from experiments.cli.stop import Workers
+from experiments.coculture.base import SHARE, Array, ShareEstimate, Wanted
+from experiments.coculture.task import Coculture
 from experiments.laws import registry
-from experiments.laws.share.base import Array, ShareEstimate, Wanted
 from experiments.reporting.tables import number
 from experiments.train import main as train
 from experiments.training import build, tasks
-from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Act, Evaluation
 from experiments.training.session import Session
 from tests.entry import command
@@ -183,7 +183,7 @@ def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
 
     Its target is not one of the policies' but any, and those with a period of a minute act within a decision, too.
     """
-    law = registry.build(registry.config(kind, registry.SHARE), registry.SHARE)
+    law = registry.build(registry.config(kind, SHARE), SHARE)
     n, each_min = len(start), round(config.control_min)
     law.reset(n)
     state, goal, total = start[:, :3], start[:, 3:], np.zeros(n)

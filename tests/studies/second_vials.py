@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.laws.share.base import Array, Law, ShareEstimator, Wanted
+from experiments.coculture.base import Array, Law, ShareEstimator, Wanted
 
 DAY = 1440  # minutes
 VOLUME = 20.0  # mL, constant: what comes in pushes as much out

@@ -16,12 +16,12 @@ from conf.schema import check, setting
 from dqn.policy import load
 from experiments.cli import files
 from experiments.cli.stop import Workers
-from experiments.control.assemble import COMPOSITION
-from experiments.control.policies import SHIPPED_COMPOSITION
+from experiments.coculture.base import SHARE, Array
+from experiments.coculture.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.coculture.policies import SHIPPED_COMPOSITION
+from experiments.coculture.recall import Recall
+from experiments.coculture.run import COMPOSITION
 from experiments.laws import registry
-from experiments.laws.share.base import Array
-from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
-from experiments.laws.share.recall import Recall
 from tests.entry import command
 from tests.studies import second_vials
 from tests.studies.results import leave
@@ -65,7 +65,7 @@ class TwoSpeciesConfig:
 def flown(conditions: Conditions, law: str, program: str, hours: float, seed: int, samples: int = 0) -> Trace:
     """One law on all vials, by the project's estimator as it is."""
     policy = load(SHIPPED_COMPOSITION[law]) if law in SHIPPED_COMPOSITION else None
-    made = registry.build(registry.config(law, registry.SHARE), registry.SHARE, policy=policy)
+    made = registry.build(registry.config(law, SHARE), SHARE, policy=policy)
     when = [24.0 * (k + 0.5) / samples for k in range(round(hours / 24.0) * samples)] if samples else []
     estimator = Recall(CompositionEstimator(CompositionEstimatorConfig()))
     return second_vials.run(conditions, estimator, made, PROGRAMS[program], hours, seed=seed, samples=when)

@@ -1,5 +1,6 @@
 """What a run knows of one vial: a Kalman filter for OD, growth rate, pump gain and what temperature does to growth."""
 
+from copy import copy
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -155,14 +156,33 @@ class Estimator:
         if not idx.size:
             return
         reading = np.maximum(od[idx], FIXED.lowest_od)
-        assumed = np.hypot(self.config.noise_floor, self.config.noise_relative * reading) ** 2 / reading**2
         began = ~np.isnan(self._minute[idx])
         dt = np.where(began, minute[idx] - np.where(began, self._minute[idx], 0.0), 0.0)
         self._predict(idx, dt, self._warmer(idx))
-        self._update(idx, np.log(reading), assumed, began)
+        self._update(idx, np.log(reading), self._assumed(reading), began)
         self._minute[idx] = minute[idx]
         if self._heard:
             self._given_ml[idx] = 0.0
+
+    def _assumed(self, reading: Array) -> Array:
+        """Variance of the logarithm of a reading, before the level of the noise is learned."""
+        return np.asarray(np.hypot(self.config.noise_floor, self.config.noise_relative * reading) ** 2 / reading**2)
+
+    def ahead(self, steps_min: Array, volume_ml: Array) -> Array:
+        """Predict ln of readings after steps of so many minutes, each after a dose, (K,) of one vial: mean, sd, (K, 2).
+
+        What it knows does not change.
+        """
+        future, one, found = copy(self), np.zeros(1, dtype=np.intp), []
+        future.mean, future.cov, future._idle_min = self.mean.copy(), self.cov.copy(), self._idle_min.copy()
+        warmer = np.nan_to_num(self._warm - self._first_warm)
+        for minutes, ml in zip(steps_min, volume_ml, strict=True):
+            future._given_ml = np.full(1, ml)
+            future._predict(one, np.full(1, minutes), warmer)
+            reading = np.maximum(np.exp(future.mean[:, LOG_OD]), FIXED.lowest_od)
+            variance = future.cov[:, LOG_OD, LOG_OD] + self._assumed(reading) * self._noise
+            found.append((future.mean[0, LOG_OD], np.sqrt(variance[0])))
+        return np.reshape(found, (-1, 2))
 
     def _warmer(self, idx: NDArray[np.intp]) -> Array:
         """Mean temperature since the reading before, over the first one, degC; 0 where none was ever measured."""

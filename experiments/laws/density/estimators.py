@@ -50,6 +50,10 @@ class DensityEstimator(Remembers, Protocol):
         """B, what one period of full pump takes off ln x, (N,)."""
 
     @property
+    def loudness(self) -> Array:
+        """Sum of the squares of the last ten innovations in units of their sd, each at most 9, (N,)."""
+
+    @property
     def loud(self) -> Mask:
         """Whether readings are far further off than it believes possible, (N,)."""
 

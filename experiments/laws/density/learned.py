@@ -18,6 +18,8 @@ from experiments.laws.density.estimator import EstimatorConfig
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
 WATCHED = 2.0  # sd of an estimate that count as its error
+LOUDER = 1.5  # loudness of the policy's filter over that of the second one, above which the second one knows better
+NOTED = 36.0  # loudness that is worth a note, whoever knows better
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) 
     if policy.observation != RELATIVE:
         return {}
     second = {f"fallback.estimator.{key}": value for key, value in asdict(EstimatorConfig()).items()}
-    law = {"fallback.law": "clip(e + s, 0, 1)", "fallback.watched_sd": WATCHED}
+    law = {"fallback.law": "clip(e + s, 0, 1)", "fallback.watched_sd": WATCHED, "fallback.louder": LOUDER}
     return estimators.settings(_estimator(policy, changes)) | second | law
 
 
@@ -101,16 +103,16 @@ class RelativeController:
 
     A supervisor stands over it. Where the estimator's surprises do not fit what it believes, or twice its sd of e or s
     leaves the bounds of the certificate, the one-line law u = u_max clip(e + s, 0, 1) decides, on a second filter whose
-    settings nobody can change (docs/certificate.md, The supervisor). Surprises do not fit that are far too large, or
-    long far too small while those of the second filter are not. The error of s is how far the s that the policy is
-    shown may lie from the true one, which is between 0 and the highest that was proven: above it no pump rate holds the
-    culture.
+    settings nobody can change (docs/certificate.md, The supervisor). Innovations do not fit that are far too large and
+    larger than those of the second filter, or long far too small while those of the second filter are not. The error of
+    s is how far the s that the policy is shown may lie from the true one, which is between 0 and the highest that was
+    proven: above it no pump rate holds the culture.
 
     Args: policy: with observation (error, growth_share). estimator: its settings. model: mu, tau, control period and
       largest pump rate; mu and tau are where the filters begin. bounds: of the certificate; None: surprises alone.
     """
 
-    remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm")
+    remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm", "noted")
 
     def __init__(self, policy: Policy, estimator: Any, model: EnvConfig, bounds: EstimateBounds | None = None) -> None:
         self.policy, self.model, self.bounds = policy, model, bounds
@@ -123,7 +125,7 @@ class RelativeController:
         self.second.reset(n)
         self._rate, self._q = np.zeros(n), np.full((n, self.policy.actions.size), np.nan)
         self._seen, self._sure = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
-        self._supervised, self._alarm = np.zeros((2, n), dtype=np.bool_)
+        self._supervised, self._alarm, self._noted = np.zeros((3, n), dtype=np.bool_)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """See `Watches.watch`."""
@@ -137,11 +139,13 @@ class RelativeController:
         now = usable(od, rows)
         observation, sure = (np.stack(pair(setpoint), axis=1) for pair in (self.estimator.relative, self.estimator.sd))
         q = self.policy.q_values(observation)
-        alarm = self.estimator.loud | (self.estimator.quiet & ~self.second.quiet)
+        loudness = self.estimator.loudness
+        loud = self.estimator.loud & (loudness > LOUDER * self.second.loudness)
+        alarm = loud | (self.estimator.quiet & ~self.second.quiet)
         supervised = alarm | self._outside(setpoint, observation)
         error, share = self.second.relative(setpoint)
         rate = np.where(supervised, np.clip(error + share, 0.0, 1.0), self.policy.actions[q.argmax(axis=1)])
-        self._supervised[now], self._alarm[now] = supervised[now], alarm[now]
+        self._supervised[now], self._alarm[now], self._noted[now] = supervised[now], alarm[now], (loudness > NOTED)[now]
         self._q[now], self._seen[now], self._sure[now] = q[now], observation[now], sure[now]
         self._rate[now] = self.model.max_pump_rate * rate[now]
         for each in (self.estimator, self.second):
@@ -166,7 +170,8 @@ class RelativeController:
 
     def explain(self) -> dict[str, Array]:
         """Whether the supervisor decided, what the policy saw with its sd, and the estimates behind it, each (N,)."""
-        said = {"supervised": self._supervised.astype(np.float64), "alarm": self._alarm.astype(np.float64)}
+        flags = {"supervised": self._supervised, "alarm": self._alarm, "noted": self._noted}
+        said = {name: flag.astype(np.float64) for name, flag in flags.items()}
         (error, share), (error_sd, share_sd) = self._seen.T.copy(), self._sure.T.copy()
         seen = {"error": error, "growth_share": share, "error_sd": error_sd, "growth_share_sd": share_sd}
         return {**said, **seen, **lead(self._q), **self.estimator.explain()}

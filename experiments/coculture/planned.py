@@ -9,9 +9,9 @@ from conf.schema import setting
 from envs.coculture.optimum import best_action, cost_to_go, transitions
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig
-from experiments.laws.share.base import Array, ShareEstimate, Wanted
-from experiments.laws.share.laws import Index, LawConfig, Periodic
-from experiments.laws.share.program import Program
+from experiments.coculture.base import Array, ShareEstimate, Wanted
+from experiments.coculture.laws import Index, LawConfig, Periodic
+from experiments.coculture.program import Program
 
 __all__ = ["Optimum", "OptimumConfig", "Receding", "RecedingConfig"]
 

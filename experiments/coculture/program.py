@@ -1,20 +1,84 @@
 """The share that is asked for over time, and how much of it is known ahead."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conf.schema import require
-from experiments.laws.share.base import Array, Wanted
+from conf.schema import require, setting
+from envs.scenario import Scenario
+from experiments.coculture.base import Array, Wanted
 
-__all__ = ["SINE_LEAD_MIN", "Program"]
+__all__ = ["SINE_LEAD_MIN", "Program", "Ratios", "composed", "program_of", "ratios_of", "resting"]
+
+ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
 
 SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4
 """A share that changes all the time is announced as a step to the one so far ahead, after that part of this time
 (docs/coculture.md, Composition controllers).
 """
+
+
+class Ratios:
+    """What a scenario may ask for beside its density: a share, phase by phase or as a sine, t since the recovery ended.
+
+    Where it does, whoever controls the composition decides on the temperature; elsewhere the schedule's holds.
+    """
+
+    ratios: tuple[float | None, ...] = setting(
+        (),
+        "setpoint of the share of B in each phase, null for none; empty: in no phase",
+        above=0.0,
+        below=1.0,
+    )
+    ratio_sine: tuple[float, ...] = setting(
+        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
+    )
+
+    def __post_init__(self) -> None:
+        scenario = cast(Scenario, self)
+        object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
+        if composed(scenario):
+            why = "[] where a share is asked for, whose controller plans by the minutes"
+            require(not any(scenario.until), "scenario.until", scenario.until, why)
+            if scenario.announce_min is None:
+                object.__setattr__(self, "announce_min", ANNOUNCED_MIN)
+        scenario.one_each("ratios")
+        if self.ratio_sine:
+            require(not self.ratios, "scenario.ratios", self.ratios, "[] beside ratio_sine")
+            given = tuple(self.ratio_sine)
+            words = "mean, amplitude and period in min > 0, with |amplitude| < mean and |amplitude| < 1 - mean"
+            require(len(given) == 3 and given[2] > 0.0, "scenario.ratio_sine", given, words)
+            mean, amplitude, _ = given
+            require(abs(amplitude) < mean and mean + abs(amplitude) < 1.0, "scenario.ratio_sine", given, words)
+
+
+def ratios_of(scenario: Scenario) -> Ratios:
+    """Return a scenario as what asks for a share."""
+    return cast(Ratios, scenario)
+
+
+def composed(scenario: Scenario) -> bool:
+    """Whether a share is asked for at any time."""
+    asked = ratios_of(scenario)
+    return bool(asked.ratio_sine) or any(r is not None for r in asked.ratios)
+
+
+def resting(scenario: Scenario, even_c: float) -> Scenario:
+    """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""
+    return replace(scenario, temperatures=tuple(even_c if t is None else t for t in scenario.temperatures))
+
+
+def program_of(scenario: Scenario) -> "Program":
+    """Return the program of the share in a schedule."""
+    asked = ratios_of(scenario)
+    if asked.ratio_sine:
+        mean, amplitude, period = asked.ratio_sine
+        return Program((), scenario.minutes, (mean, amplitude, period))
+    ratios = asked.ratios or (None,) * len(scenario.minutes)
+    return Program(tuple(math.nan if r is None else r for r in ratios), scenario.minutes)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from dqn.hindsight import ProgramRelabel, Relabel
-from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from dqn.policy import Policy
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import (
     LOGIT,
@@ -28,7 +28,8 @@ from envs.coculture.task import (
     passed,
     share,
 )
-from experiments.reporting import composition_charts
+from experiments.coculture import charts
+from experiments.coculture.base import SEEN, SEEN_AHEAD
 from experiments.training.evaluation import Rollout, each, rollout
 
 __all__ = ["Coculture"]
@@ -59,7 +60,7 @@ class Coculture:
         self.description = f"shares of two species by temperature, {every}, {ahead}"
         self.tried = f"plant=coculture scenario=ratio_steps composition={law} composition_policy={{}}"
         self.steady_steps = max(1, config.episode_steps // 6)
-        self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
+        self.observation: tuple[str, ...] = SEEN_AHEAD if config.preview_min else SEEN
         self.actions = config.targets()
         self.limits = limits(config)
         for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.span, strict=True):
@@ -158,7 +159,7 @@ class Coculture:
         last = share(picked[:, NEXT if self.config.preview_min else SETPOINT])
         wanted = np.where(hours[:, None] <= change, share(picked[:, SETPOINT]), last)
         temperatures = (self.actions[ours.action[:, 0]], self.actions[theirs.action[:, 0]])
-        figure = composition_charts.episodes(
+        figure = charts.episodes(
             hours,
             wanted,
             share(ours.state[:, 0]),

@@ -64,6 +64,8 @@ class FluorescenceSensor:
     rising precedence: `dead` (reads 0), `saturated`, `frozen`.
     """
 
+    strain = 1
+
     def __init__(self, config: FluorescenceConfig, rngs: Streams, pair: PairConfig) -> None:
         self.config, self._pair, n = config, pair, len(rngs)
         parts = [r.spawn(2) for r in rngs]

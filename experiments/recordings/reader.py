@@ -1,21 +1,23 @@
-"""A reader for the recordings of this project and for every file a Chi.Bio leaves behind.
+"""A reader for the recordings of this project, of Chi.Bio, Pioreactor and eVOLVER, and for tables of readings.
 
 `read_recording` refuses whatever is not a usable recording, and reports what it left out of one that is.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from experiments.recordings.layout import Asked, Layout, Rows
+from experiments.recordings.table import MIN_ROWS, Cells, named_rows, read_table
 from hardware.errors import RecordingError
-from hardware.storage.recording_file import MIN_ROWS, Cells, Layout, Rows, named_rows, read_table
 
 __all__ = ["Recording", "read_recording"]
 
@@ -26,7 +28,9 @@ Numbers = NDArray[np.int64]
 WASTE_PUMP = 2  # of the Chi.Bio; it follows the feed pump and does not dilute
 LOWEST_OD = -0.05  # blank error and noise reach this far below zero; a culture does not
 HIGHEST_OD = 10.0  # the device's own upper limit; a dead spectrometer reads 11 to 14 (docs/device.md, OD measurement)
-RAW_COUNT_OD = 30.0  # a median above this is a photodetector count
+DENSEST_OD = 6.0  # a median above this is no OD of a culture in a vial ...
+RAW_COUNT_OD = 500.0  # ... but OD times 100, and above this a photodetector count
+FINEST_MIN, COARSEST_MIN = 0.005, 30.0  # from row to row
 HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
 RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch
 LISTED_RUNS = 20
@@ -72,22 +76,29 @@ def read_recording(
     run: int | None = None,
     reactor: str | None = None,
     rows: Rows = (0, None),
+    doses: str | Path | None = None,
+    columns: Mapping[str, str] = MappingProxyType({}),
+    time_unit: str | None = None,
 ) -> Recording:
-    """Read a recording from a Chi.Bio's own CSV, from `Recorder`'s, or from a tidy three-column file.
+    """Read a recording from a device's own file, from `Recorder`'s, or from a table.
 
     Known layouts: the Chi.Bio's named columns (exp_time in s, od_measured, pump_1_rate as a share of full power), the
-    same without header (known by position), any file with columns such as time_min, od, pump_rate_ml_s, and three bare
-    columns minutes, OD, mL/s. Semicolon, tab, comma and blank separate; beside the first two a comma is decimal. Time
-    may be a date or count s or ms since 1970. The text is UTF-8 or UTF-16, plain or gzipped.
+    same without header (known by position), any file with columns such as time_min, od, and pump_rate_ml_s, dose_ml or
+    fed_ml, three bare columns minutes, OD, mL/s, a Pioreactor's export (zip) or one of its tables, and an eVOLVER's OD
+    beside its pump log. In a file with doses a row is a reading, a dose or both, blank cells are allowed, and a dose
+    counts from the next reading on. Semicolon, tab, comma and blank separate; beside the first two a comma is decimal.
+    Time may be a date or count s or ms since 1970. The text is UTF-8 or UTF-16, plain or gzipped.
 
     Args:
       path: of the file.
-      pump_ml_s: flow of the Chi.Bio's feed pump at full power, mL/s, > 0; turns its duty into mL/s. Not used for
-        files that hold mL/s.
+      pump_ml_s: flow of the feed pump at full power, mL/s, > 0; turns a Chi.Bio's duty into mL/s, and the seconds that
+        a pump ran into mL. Not used for files that hold mL or mL/s.
       pumps: which of the Chi.Bio's pumps feed the vial, 1 to 4; their flows add up. Not used for other files.
       run: which of several concatenated runs, from 0; None takes the one with most rows.
       reactor: which reactor of a file with a column `reactor`; None takes the first.
       rows: data rows [first, end) to read, counted from 0; what lies outside is not looked at. None: to the end.
+      doses: a second file with the doses: an eVOLVER's pump log, a Pioreactor's dosing events, or a table.
+      columns: name in the file of one of `COLUMNS`. time_unit: s, min or h, where no column's name tells it.
     Raises: RecordingError, one line that ends in the notes so far, when the file is no recording; what can be left out
       is left out and noted.
     """
@@ -97,21 +108,26 @@ def read_recording(
     notes: list[str] = []
     try:
         with np.errstate(all="ignore"):  # what overflows is not finite, and is dropped as that
-            layout, table = read_table(path, pump_ml_s, pumps, reactor, rows, notes)
+            asked = Asked(pump_ml_s, pumps, reactor, rows, columns, time_unit)
+            layout, table = read_table(path, None if doses is None else Path(doses), asked, notes)
             doubts = _idle_pumps(layout, table, pumps, notes)
             table = _with_times_and_rates(path, table, notes)
-            return _judged(path, layout.source, table, run, notes, doubts)
+            highest = HIGHEST_PUMP_RATE if layout.feed == "rate" else math.inf
+            return _judged(path, layout.source, table, highest, run, notes, doubts)
     except RecordingError as error:
         raise RecordingError(f"{error} ({'; '.join(notes)})" if notes else str(error)) from None
 
 
-def _judged(path: Path, source: str, table: Cells, run: int | None, notes: list[str], doubts: Doubts) -> Recording:
-    """Build the recording of rows with finite times and rates, without what cannot be used."""
-    backward = _backward(path, table.pump_rate, table.number)
+def _judged(
+    path: Path, source: str, table: Cells, highest: float, run: int | None, notes: list[str], doubts: Doubts
+) -> Recording:
+    """Build the recording of rows with finite times and rates, without what cannot be used. highest: rate, mL/s."""
+    backward = _backward(path, table.pump_rate, table.number, highest)
     _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
     table = table.only(~backward)
     runs = _runs(table.time_min, np.diff(table.headers, prepend=table.headers[0]) > 0)
     keep, stale = _choose_run(path, runs, table.number, run, notes)
+    _check_spacing(path, table.time_min[keep])
     _note(notes, table.number[stale], "time does not advance (repeated or backward): dropped")
     ends = tuple((int(table.number[r.rows[0]]), int(table.number[r.rows[-1]])) for r in runs)
     table = table.only(keep)
@@ -216,11 +232,11 @@ def _choose_run(path: Path, runs: Sequence[_Run], number: Numbers, run: int | No
     return runs[chosen]
 
 
-def _backward(path: Path, pump_rate: Array, number: Numbers) -> Mask:
+def _backward(path: Path, pump_rate: Array, number: Numbers, highest: float) -> Mask:
     """Rows in which the pump ran backwards, (n,). Raises: RecordingError for many, and for any impossible rate."""
     backward = pump_rate < 0.0
     few = backward.mean() <= LOST_SHARE
-    wrong = (pump_rate > HIGHEST_PUMP_RATE) | (backward & ~few)
+    wrong = (pump_rate > highest) | (backward & ~few)
     if wrong.any():
         i = int(np.argmax(wrong))
         raise RecordingError(
@@ -230,13 +246,25 @@ def _backward(path: Path, pump_rate: Array, number: Numbers) -> Mask:
     return backward
 
 
+def _check_spacing(path: Path, time: Array) -> None:
+    """Refuse times in a wrong unit. Raises: RecordingError."""
+    apart = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    if not FINEST_MIN <= apart <= COARSEST_MIN:
+        raise RecordingError(
+            f"{path}: rows are {apart:.3g} min apart: allowed {FINEST_MIN:g} to {COARSEST_MIN:g} min; "
+            f"is the time in {'s or min' if apart > COARSEST_MIN else 'min or h'} (time_unit=)?"
+        )
+
+
 def _usable_od(path: Path, od: Array, number: Numbers, notes: list[str]) -> Array:
     """OD with nan for unusable readings, each kind noted. Raises: RecordingError when too few remain."""
     finite = np.isfinite(od)
-    if finite.any() and float(np.median(od[finite])) > RAW_COUNT_OD:
+    middle = float(np.median(od[finite])) if finite.any() else 0.0
+    if middle > DENSEST_OD:
+        likely = "raw detector counts" if middle > RAW_COUNT_OD else "OD times 100"
         raise RecordingError(
-            f"{path}: OD has the median {np.median(od[finite]):.0f}: these look like raw detector counts; expected an "
-            f"optical density of 0 to {HIGHEST_OD:g}; convert counts by the blank first (OD ~ log10(blank / raw))"
+            f"{path}: OD has the median {middle:.3g}: these look like {likely}; expected an optical density of 0 to "
+            f"{HIGHEST_OD:g}; divide OD times 100 or 1000, convert counts by the blank (OD ~ log10(blank / raw))"
         )
     low, high = finite & (od < LOWEST_OD), finite & (od > HIGHEST_OD)
     _note(notes, number[~finite], "OD is not a finite number: reading rejected")

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.bench import Bench
+from envs.coculture.fluorescence import DAY_MIN
 from envs.coculture.pair import PairConfig
-from envs.plant.fluorescence import DAY_MIN
-from experiments.laws.share.base import Array, Mask, ShareEstimate
+from experiments.coculture.base import Array, Mask, ShareEstimate
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 

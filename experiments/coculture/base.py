@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from experiments.laws.base import Array, Mask
 from hardware.memory import Remembers
 
-__all__ = ["Acts", "Array", "Law", "Mask", "ShareEstimate", "ShareEstimator", "Wanted"]
+__all__ = ["SEEN", "SEEN_AHEAD", "SHARE", "Acts", "Array", "Law", "Mask", "ShareEstimate", "ShareEstimator", "Wanted"]
+
+SHARE = "share"
+"""The signal, by which its laws are known."""
+SEEN = ("logit_share", "temperature", "rate", "logit_setpoint")
+SEEN_AHEAD = (*SEEN, "logit_next", "minutes_to_change")
+"""What a learned law sees (envs/coculture/task.py), and where changes are announced; it answers with degC."""
 
 
 @dataclass(frozen=True, eq=False)

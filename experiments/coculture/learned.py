@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from conf.schema import build, require, setting
-from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from dqn.policy import Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
-from experiments.laws.share.base import Array, ShareEstimate, Wanted
-from experiments.laws.share.laws import Index, LawConfig, Periodic
+from experiments.coculture.base import SEEN, SEEN_AHEAD, Array, ShareEstimate, Wanted
+from experiments.coculture.laws import Index, LawConfig, Periodic
 
 __all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
 
@@ -57,7 +57,7 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
 
     def _check(self, policy: Policy) -> None:
         preview = self.config.kind == "dqn_preview"
-        task, expected = ("coculture_preview", COCULTURE_PREVIEW) if preview else ("coculture", COCULTURE)
+        task, expected = ("coculture_preview", SEEN_AHEAD) if preview else ("coculture", SEEN)
         remedy = f"one with observation {list(expected)}, as env={task} trains"
         require(policy.observation == expected, "policy", list(policy.observation), remedy)
         known = build(PairConfig(), policy.metadata["model"].get("pair", {}), "pair")
@@ -72,7 +72,7 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
         known = self.policy.metadata["model"].get("scale_e", 1.0)
         rate = estimate.rate - (1.0 + estimate.error_e - known) * self.pair.rates(self._even_c)[0]
         columns = [estimate.logit, estimate.temperature, rate, now]
-        if self.policy.observation == COCULTURE_PREVIEW:
+        if self.policy.observation == SEEN_AHEAD:
             shown = wanted.minutes <= self.preview_min
             columns += [np.where(shown, logit(wanted.following), now), np.where(shown, wanted.minutes, 0.0)]
         return self.policy.chosen(np.stack(columns, axis=1))

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.laws.share.base import Array, Mask, ShareEstimate
-from experiments.laws.share.estimator import CompositionEstimator
+from experiments.coculture.base import Array, Mask, ShareEstimate
+from experiments.coculture.estimator import CompositionEstimator
 
 __all__ = ["Recall"]
 

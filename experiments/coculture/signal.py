@@ -4,20 +4,23 @@ import bisect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
+from envs.bench import Bench
 from envs.coculture.task import logit
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
-from experiments.laws.share.program import Program
+from experiments.coculture.base import Array, Law, Mask, ShareEstimator, Wanted
+from experiments.coculture.program import program_of
 from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
-__all__ = ["COLUMNS", "TRUE", "LightSignal", "Share", "ShareWarnings", "program_of"]
+__all__ = ["COLUMNS", "TRUE", "LightSignal", "Share", "ShareWarnings"]
 
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
@@ -46,15 +49,6 @@ class ShareWarnings:
 
     def __post_init__(self) -> None:
         check(self, "share_warnings")
-
-
-def program_of(schedule: Scenario) -> Program:
-    """Return the program of the share in a schedule."""
-    if schedule.ratio_sine:
-        mean, amplitude, period = schedule.ratio_sine
-        return Program((), schedule.minutes, (mean, amplitude, period))
-    ratios = schedule.ratios or (None,) * len(schedule.minutes)
-    return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
 
 
 class LightSignal:
@@ -94,7 +88,7 @@ class Share:
     uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
 
     Args: estimator: what is believed; law: what is done about it; schedules: one per reactor; warnings: when to warn.
-      simulated: the recording has the true share, which `truth` gives.
+      simulated: the recording has the true share, which `truth` gives. species: whose share it is, in figures.
     """
 
     name, actuator, sees_light = "composition", THERMOSTAT.name, True
@@ -107,9 +101,11 @@ class Share:
         schedules: Sequence[Scenario],
         warnings: ShareWarnings | None = None,
         simulated: bool = False,
+        species: str = "the second species",
     ) -> None:
         self.estimator, self.law, self.controller = estimator, law, Decider(estimator, law)
         self.schedules, self.warnings, self.simulated = schedules, warnings or ShareWarnings(), simulated
+        self.species = species
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)
         n = len(schedules)
         self._goal, self._best = np.full((2, n), np.nan), np.full((2, n), np.nan)  # the nearest share to it so far
@@ -121,6 +117,10 @@ class Share:
     def columns(self) -> tuple[str, ...]:
         """See `Signal`; a simulation's true share is the last."""
         return (*COLUMNS, TRUE) if self.simulated else COLUMNS
+
+    def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
+        """See `Knows.known`."""
+        self.truth = lambda: plant.culture.share
 
     def decide(self, sample: Sample) -> Array:
         """See `Signal.decide`; nan where no share is asked for."""
@@ -237,3 +237,9 @@ class Share:
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
         """See `Signal.dosed`; what was put off comes later."""
         self.estimator.dosed(volume_ml)
+
+    def figures(self, table: Any, title: str) -> dict[str, Any]:
+        """See `Draws.figures`."""
+        from experiments.coculture.charts import composition_figure_of  # Matplotlib
+
+        return {"composition": composition_figure_of(table, self.schedules, self.species, title)}

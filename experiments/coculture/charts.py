@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from envs.coculture.pair import PairConfig
 from envs.identification.curves import Plateau
+from envs.scenario import Scenario
+from experiments.coculture.program import program_of
+from experiments.record.record import Recordings
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["composition_figure", "episodes", "pair_figure"]
+__all__ = ["composition_figure", "composition_figure_of", "episodes", "pair_figure"]
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, Array]
@@ -102,6 +105,20 @@ def composition_figure(
     pump.set_ylabel("pump rate,\nµL/s")
     light.set(ylabel="fluorescence,\ncounts", xlabel="time, h")
     return figure
+
+
+def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
+    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
+    announced, counted = [], []
+    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
+        began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
+        minute, share = program_of(scenario).announcements(scenario.announced_min)
+        known = minute + began <= np.nanmax(table.columns["time_min"][n], initial=-np.inf)  # a run may end before
+        announced.append((minute[known] + began, share[known]))
+        mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
+        counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
+    columns = {**table.columns, "od": table.od(), "setpoint": table.setpoints()}
+    return composition_figure(columns, table.names, species, title, announced, counted)
 
 
 def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure:

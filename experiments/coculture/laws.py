@@ -11,8 +11,8 @@ from conf.schema import check, part, setting
 from envs.coculture.optimum import best_action
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, logit
-from experiments.laws.share.base import Array, Mask, ShareEstimate, Wanted
-from experiments.laws.share.estimator import CompositionEstimatorConfig
+from experiments.coculture.base import Array, Mask, ShareEstimate, Wanted
+from experiments.coculture.estimator import CompositionEstimatorConfig
 
 __all__ = [
     "PI", "BangBang", "BangBangConfig", "InverseDynamics", "InverseDynamicsConfig", "LawConfig", "Midpoint",

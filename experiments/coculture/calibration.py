@@ -6,8 +6,8 @@ import numpy as np
 
 from conf.schema import require
 from envs.coculture.pair import PairConfig
-from experiments.laws.share.base import Array
-from experiments.laws.share.estimator import CompositionEstimatorConfig
+from experiments.coculture.base import Array
+from experiments.coculture.estimator import CompositionEstimatorConfig
 
 __all__ = ["SensorCalibration", "calibrate_sensor"]
 

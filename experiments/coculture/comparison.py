@@ -1,0 +1,340 @@
+"""Comparison of controllers of the composition: their closed loops, numbers, figures and page."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from envs.bench import Bench
+from envs.coculture.second import of_pair, of_plant
+from envs.plant.plant import Plant
+from experiments.cli import frame
+from experiments.coculture.base import SHARE, Array
+from experiments.coculture.config import of_benchmark, of_study, read_pair
+from experiments.coculture.estimator import CompositionEstimator
+from experiments.coculture.policies import composition_policy
+from experiments.coculture.program import program_of, resting
+from experiments.coculture.recall import Recall
+from experiments.coculture.signal import TRUE, Share
+from experiments.comparison import page, run, statistics, studies, trials
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.comparison.figures import by_plant, estimate
+from experiments.comparison.page import Row, Section, law_of, matrix, scaled
+from experiments.comparison.statistics import Spread
+from experiments.comparison.studies import Drawing
+from experiments.comparison.trials import Cell, Followed, Trial, closed, record
+from experiments.control.policies import load_policy
+from experiments.laws import registry
+from experiments.laws.base import Controller
+from experiments.loop.loop import Step
+from experiments.loop.signals import Signal
+from experiments.reporting.charts import COLOURS, new_figure
+from experiments.reporting.page import Page
+from experiments.reporting.tables import number
+from hardware.safety.config import SafetyConfig
+
+__all__ = [
+    "ShareCell", "ShareTrial", "abs_error", "calibrate", "last_hours", "policies_of", "share_errors", "share_row",
+    "shares", "with_pair",
+]  # fmt: skip
+
+FACTOR_SD, OFFSET_SD = 0.02, 5.0
+"""Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
+FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # laws that act on what is announced
+COLUMNS = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
+"""Fields of a `ShareTrial` and the columns of a recording that they are."""
+
+SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
+STEP = 5  # minutes between the points of a share's curve
+LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
+DEFINITIONS = {
+    "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
+    "for.",
+    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; the optimum knows "
+    "the whole program in either case.",
+    "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "
+    "5 counts; otherwise it begins from the mean of 17 real reactors.",
+    "paired": "law minus the vendor's PI, reactor by reactor: both meet the same vials, sensors and noise.",
+    "band covers": "share of all minutes in which the true share lies within the estimate's 95 % band.",
+}
+
+
+@dataclass(frozen=True)
+class ShareCell(Cell):
+    """A loop of a share.
+
+    density: the controller that holds the OD beside it; announced: its changes are told ahead, as the scenario has it;
+    calibrated: the light sensor was, with its errors.
+    """
+
+    signal: str = SHARE
+    density: str = ""
+    announced: bool = False
+    calibrated: bool = False
+
+    @property
+    def vials(self) -> tuple[object, ...]:
+        """See `Cell.vials`."""
+        return *super().vials, self.density, self.calibrated
+
+
+@dataclass(frozen=True, eq=False)
+class ShareTrial(Trial):
+    """A share that was held, minute by minute; arrays (N, K).
+
+    foresight: the law knew of changes ahead. setpoint: (K,), nan where no share is asked for. share, od: true ones.
+    estimate, low, high: of the share and its 95 % band.
+    """
+
+    foresight: bool
+    setpoint: Array
+    share: Array
+    estimate: Array
+    low: Array
+    high: Array
+    od: Array
+
+    def names(self) -> dict[str, Any]:
+        """See `Trial.names`."""
+        cell = cast(ShareCell, self.cell)
+        beside = {"preview": self.foresight, "density": cell.density, "calibrated": cell.calibrated}
+        return super().names() | beside
+
+
+def _run(config: BenchmarkConfig, cell: ShareCell, followed: Followed | None) -> ShareTrial:
+    """Run a trial in which a law holds the share, and a controller the density beside it."""
+    composition, policy = of_benchmark(config).compositions[cell.controller], followed[0] if followed else None
+    scenario, pair = config.scenarios[cell.scenario], read_pair(of_benchmark(config).pair)
+    schedule = scenario if cell.announced else replace(scenario, announce_min=0.0)
+    program, (coldest, warmest) = program_of(scenario), pair.temperatures
+
+    def make(plant: Plant, bench: Bench) -> tuple[Controller, Sequence[Signal], SafetyConfig]:
+        law = registry.build(composition, SHARE, policy=policy, program=program, pair=pair)
+        estimator = CompositionEstimator(composition.estimator, np.full(plant.n, bench.volume_ml), pair)
+        share = Share(Recall(estimator), law, [schedule] * plant.n, simulated=True)
+        if cell.calibrated:
+            calibrate(estimator, plant, config.seed)
+        safety = SafetyConfig(composition_low=coldest, composition_high=warmest)
+        return _beside(config, cell.density), (share,), safety
+
+    plant_config = config.plants[cell.plant]
+    loop, plant = closed(plant_config, schedule, config.env, config.replicates, config.seed, make)
+
+    def seen(step: Step) -> dict[str, Array]:
+        columns = {key: step.columns[column] for key, column in COLUMNS.items()}
+        return columns | {"temperature": step.temperature, "od": plant.culture.od}
+
+    minute, found = record(loop, seen)
+    foresight = cell.announced and composition.kind in FORESIGHT
+    return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
+
+
+def _beside(config: BenchmarkConfig, name: str) -> Controller:
+    """Build the controller of the density beside a share. Raises: UserError for a policy that does not fit."""
+    kind, policy = config.controllers[name].kind, None
+    if kind == "dqn":
+        policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)
+    density: Controller = registry.build(config.controllers[name], model=config.env, policy=policy)
+    return density
+
+
+def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
+    """Tell the estimator each reactor's factor and offset, with the errors that a calibration leaves."""
+    rng = np.random.default_rng([seed, 1])
+    factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
+    offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
+    estimator.calibrate(factor, FACTOR_SD * factor, offset, OFFSET_SD)
+
+
+def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
+    """Vials of the two species, and a temperature in every phase: by default that at which they grow alike."""
+    pair = read_pair(of_benchmark(config).pair)
+    scenarios = {name: resting(s, pair.resting_c) for name, s in config.scenarios.items()}
+    plants = {name: of_pair(p, pair) if of_plant(p).second.present else p for name, p in config.plants.items()}
+    return replace(config, scenarios=scenarios, plants=plants)
+
+
+def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
+    """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
+    found: dict[str, Followed | None] = {}
+    for name in names:
+        kept = folder / "policies" / name
+        kept.mkdir(parents=True, exist_ok=True)
+        where = of_benchmark(config).composition_policies.get(name, "shipped")
+        policy = composition_policy(of_benchmark(config).compositions[name].kind, where, kept, resumed=False)
+        if policy is not None:
+            try:
+                registry.build(
+                    of_benchmark(config).compositions[name],
+                    SHARE,
+                    policy=policy,
+                    pair=read_pair(of_benchmark(config).pair),
+                )
+            except ValueError as error:
+                remedy = f"give composition_policies.{name}=RUN, or studies.NAME.compositions without {name}"
+                raise frame.UserError(f"{error}; {remedy}") from None
+        found[name] = None if policy is None else (policy, None)
+    return found
+
+
+def abs_error(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| wherever a share is asked for, (N,)."""
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint), axis=1))
+
+
+def last_hours(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| of the last 2 h of every window, (N,); nan where the share asked for changes all the time.
+
+    A law that is told of a change leaves before it comes: then this says nothing of how well it holds.
+    """
+    held, edges = np.zeros(trial.minute.size, dtype=np.bool_), trial.schedule.edges.astype(int)
+    for start, end in pairwise(edges):
+        if np.unique(trial.setpoint[start:end]).size == 1 and np.isfinite(trial.setpoint[start]):
+            held[max(start, end - LAST_MIN) : end] = True
+    error = np.abs(trial.share - trial.setpoint)[:, held]
+    return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
+
+
+def _last_day(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| of the last day of a run of two days or more, else nan, (N,)."""
+    if trial.minute[-1] < 2 * DAY_MIN:
+        return np.full(len(trial.share), np.nan)
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, -DAY_MIN:], axis=1))
+
+
+def share_row(trial: ShareTrial) -> dict[str, Any]:
+    """Build the row of a share in summary.json, judged by the true share."""
+    error = Spread(abs_error(trial))
+    inside = (trial.low <= trial.share) & (trial.share <= trial.high)
+    return trial.names() | {
+        "n": error.n,
+        "ratio_abs_error_mean": error.mean,
+        "ratio_abs_error_sd": error.sd,
+        "ci95": error.ci95,
+        "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
+        "ratio_abs_error_last_day": Spread(_last_day(trial)).mean,
+        "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
+        "band_covers": float(inside.mean()),
+        "od_min": float(trial.od.min()),
+        "od_max": float(trial.od.max()),
+        "od_mean": float(trial.od.mean()),
+    }
+
+
+def shares(trials: Sequence[ShareTrial]) -> Figure:
+    """Draw a column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
+    columns = len(trials)
+    figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
+    for k, trial in enumerate(trials):
+        top, bottom, hours = axes[k], axes[columns + k], trial.minute[::STEP] / 60.0
+        for ax, values, colour in ((top, trial.share, COLOURS[0]), (bottom, trial.temperature, COLOURS[1])):
+            low, middle, high = np.quantile(values[:, ::STEP], (0.05, 0.5, 0.95), axis=0)
+            ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
+            ax.plot(hours, middle, color=colour, linewidth=1.2)
+        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
+        top.set_title(law_of({"controller": trial.cell.controller, "preview": trial.foresight}))
+        bottom.set_xlabel("hours")
+    axes[0].set(ylabel="share of the second species", ylim=(0.0, 1.0))
+    axes[columns].set_ylabel("vial, °C")
+    return figure
+
+
+def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
+    """Error of every law on every plant of one scenario: mean and 95 % interval."""
+    labels = list(dict.fromkeys(law_of(e) for e in entries))
+    marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
+    handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
+    figure, (ax,), height = by_plant(entries, handles, 9.0, 1)
+    for e in entries:
+        estimate(ax, marks[law_of(e)], height(e), e["ratio_abs_error_mean"], e["ci95"])
+    ax.set(xlabel="mean |r - setpoint|", xlim=(0.0, None))
+    return figure
+
+
+def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iterator[Drawing]:
+    """Two figures of every scenario in which a share is held: every law and plant; the shares on the first plant."""
+    for scenario in dict.fromkeys(t.cell.scenario for t in trials):
+        here = [t for t in trials if t.cell.scenario == scenario]
+        plant = here[0].cell.plant
+        first = [t for t in here if t.cell.plant == plant]
+        if len(first) > len(SHOWN):
+            first = [t for t in first if t.cell.controller in SHOWN]
+        yield Drawing(
+            f"composition_{scenario}_laws",
+            share_errors([r for r in rows if (r["signal"], r["scenario"]) == ("share", scenario)]),
+            f"{scenario}: every law and plant",
+            "Mean and 95 % interval over the reactors.",
+        )
+        yield Drawing(
+            f"composition_{scenario}_shares",
+            shares(first),
+            f"{scenario}: shares on {plant}",
+            "Line: median over the reactors; band: the middle 90 %; dashed: setpoint.",
+        )
+
+
+def _lower(pair: Row) -> str:
+    low, high = pair["ci95"]
+    between = "" if low is None or low != low else f" [{low:+.4f}, {high:+.4f}]"
+    return f"{pair['difference']:+.4f}{between}, lower in {pair['lower_in']} of {pair['n']}"
+
+
+def _estimate(row: Row) -> str:
+    return f"{number(row['estimate_rms'])}, {100.0 * row['band_covers']:.0f} %"
+
+
+def _od(row: Row) -> str:
+    return f"{row['od_min']:.3f}, {row['od_mean']:.3f}, {row['od_max']:.3f}"
+
+
+def _section(out: Page, summary: Row, run: Path) -> None:
+    """Add a section of every scenario."""
+    errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
+    for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
+        out.section(scenario)
+
+        def add(
+            key: str, entries: Sequence[Row], title: str, text: Callable[[Row], str],
+            ranked_by: str | None = None, folded: str = "", scenario: str = scenario,
+        ) -> None:  # fmt: skip
+            entries = [e for e in entries if e["scenario"] == scenario]
+            if entries:
+                note = f"n = {entries[0]['n']} reactors each."
+                table = matrix(f"{scenario}_{key}", title, entries, text, note, ranked_by, laws_down=True)
+                out.table(table, folded=folded and f"{folded}: {scenario}")
+
+        rows = summary["rows"]
+        for ending, when in errors.items():
+            key = f"ratio_abs_error{ending or '_mean'}"
+            known = [r for r in rows if r[key] is not None]
+            add(key, known, f"Mean |r - setpoint|{when}", partial(scaled, key=key), key)
+        add("paired", summary["paired"], "Difference to the vendor's PI", _lower)
+        add("estimate", rows, "Error of the estimate (rms), and how much its band covers", _estimate, folded="Estimate")
+        add("od", rows, "OD: least, mean, largest", _od, folded="OD")
+        for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
+            out.figure(run / f["file"], f["title"], f["caption"])
+
+
+def _split(study: StudyConfig, cell: Cell) -> list[Cell]:
+    """List a loop for each law of the composition, beside which the controller of the cell holds the density."""
+    two = of_study(study)
+    beside = cell.controller, two.announced, two.calibrated
+    return [ShareCell(law, cell.plant, cell.scenario, SHARE, *beside) for law in two.compositions]
+
+
+trials.SPLITS.append(_split)
+trials.RUNS[SHARE] = _run
+statistics.ROWS[SHARE] = lambda trial: [share_row(trial)]
+statistics.SCORES[SHARE] = lambda trial: [("all", "ratio_abs_error", abs_error(trial))]
+studies.AGAINST[SHARE] = ("pi",)
+studies.DRAWN[SHARE] = _drawn
+page.RANKED[SHARE] = ("ratio_abs_error_mean", "mean |r - setpoint|")
+page.SECTIONS[SHARE] = Section("Composition of two species: comparison", _section, DEFINITIONS)
+run.COMPLETED.append(with_pair)
+run.FOLLOWED[SHARE] = policies_of

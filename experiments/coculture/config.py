@@ -1,0 +1,185 @@
+"""What two species add to the configs of the core, and the files that these name."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from omegaconf import DictConfig
+
+from conf.schema import part, require, setting
+from envs.coculture.pair import FILE, PairConfig, named_pair
+from envs.coculture.second import of_plant
+from envs.coculture.task import SCALES, CocultureConfig
+from experiments.cli import files, frame
+from experiments.coculture.base import SHARE
+from experiments.coculture.program import composed
+from experiments.coculture.signal import ShareWarnings
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.control.config import DeployConfig
+from experiments.laws import registry
+from experiments.training.config import TrainConfig
+from hardware.errors import RecordingError
+from hardware.storage.journal import read_journal
+
+__all__ = [
+    "OfBenchmark", "OfDeploy", "OfEmulator", "OfStudy", "OfTrain", "completed", "of_benchmark", "of_deploy", "of_study",
+    "read_curves", "read_pair",
+]  # fmt: skip
+
+log = logging.getLogger(__name__)
+
+USUAL = "ecoli_pputida"
+
+
+class OfDeploy:
+    """What `deploy` can be told of two species."""
+
+    composition: Any = setting(
+        None,
+        "controller of the temperature if the scenario has a composition: a preset of `composition`; null: none",
+        kinds=registry.config_at,
+    )
+    composition_policy: str = setting(
+        "shipped",
+        "policy of composition=dqn and dqn_preview: `shipped`, a policy.npz, or the run folder of a training or "
+        "deployment",
+    )
+    share_warnings: ShareWarnings = part(ShareWarnings, "warnings of a composition out of control")
+    pair: str = setting(
+        USUAL, "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
+    )
+
+
+class OfEmulator:
+    """What the device in software can be told of two species."""
+
+    pair: str = setting(USUAL, "two species: a preset of conf/strains, or a pair.yaml")
+
+
+class OfTrain:
+    """What `train` can be told of two species."""
+
+    pair: str | None = setting(
+        None,
+        "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",
+    )
+
+    def __post_init__(self) -> None:
+        of_two = isinstance(cast(TrainConfig, self).env, CocultureConfig)
+        allowed = "null for a task of one species; give env=coculture_preview beside it"
+        require(self.pair is None or of_two, "pair", self.pair, allowed)
+
+
+class OfStudy:
+    """What a study of `benchmark` can be told of two species."""
+
+    compositions: tuple[str, ...] = setting(
+        (), "names of composition controllers; `controllers` then control the density beside each of them"
+    )
+    announced: bool = setting(True, "composition: announce changes in advance, as the scenario says")
+    calibrated: bool = setting(False, "composition: each reactor has a calibrated light sensor")
+
+
+class OfBenchmark:
+    """What `benchmark` can be told of two species."""
+
+    pair: str = setting(
+        USUAL, "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
+    )
+    compositions: dict[str, Any] = setting({}, "composition controllers by name", kinds=registry.config_at)
+    composition_policies: dict[str, str] = setting(
+        {}, "policies of learned composition controllers by name: `shipped`, a policy.npz or a run folder"
+    )
+
+    def __post_init__(self) -> None:
+        config = cast(BenchmarkConfig, self)
+        learned = [k for k, c in self.compositions.items() if registry.takes(c.kind, "policy", SHARE)]
+        for name in self.composition_policies:
+            require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")
+        of_two = {name: study for name, study in config.studies.items() if of_study(study).compositions}
+        same = len(of_two) in (0, len(config.studies))
+        require(same, "studies", ", ".join(config.studies), "all with compositions, or none: their numbers differ")
+        asks = [key for key, s in config.scenarios.items() if composed(s)]
+        plants = [key for key, p in config.plants.items() if of_plant(p).second.present]
+        for name, study in of_two.items():
+            unknown = [law for law in of_study(study).compositions if law not in self.compositions]
+            if unknown:
+                raise ValueError(f"studies.{name}.compositions: {unknown[0]} is none of {', '.join(self.compositions)}")
+            for key, given, having, known in (
+                ("scenarios", study.scenarios, "those with ratios", asks),
+                ("plants", study.plants, "those with two species", plants),
+            ):
+                wrong = next((one for one in given if one not in known), None)
+                require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}: {', '.join(known)}")
+
+
+def of_study(study: StudyConfig) -> OfStudy:
+    """Return a study as what two species are told by."""
+    return cast(OfStudy, study)
+
+
+def of_benchmark(config: BenchmarkConfig) -> OfBenchmark:
+    """Return a benchmark's config as what two species are told by."""
+    return cast(OfBenchmark, config)
+
+
+def of_deploy(config: DeployConfig) -> OfDeploy:
+    """Return a deployment's config as what two species are told by."""
+    return cast(OfDeploy, config)
+
+
+def read_pair(name: str) -> PairConfig:
+    """Read a pair of species: a preset of conf/strains, or the pair.yaml of a calibration.
+
+    Raises: UserError naming the presets, or the file and what is wrong with it.
+    """
+    with frame.refusing(ValueError):
+        return named_pair(name)
+
+
+def completed(config: TrainConfig) -> TrainConfig:
+    """Put the growth curves and the pair that a training run's config names into its task. Raises: UserError."""
+    pair, env = cast(OfTrain, config).pair, config.env
+    if config.env_file is not None:
+        env = read_curves(config.env_file, env)
+    if pair is not None and config.resume is None:  # a resumed run has it in env.pair
+        with frame.refusing(ValueError):
+            env = replace(env, pair=read_pair(pair))
+    return config if env is config.env else replace(config, env=env, env_file=None)
+
+
+def read_curves(run: str, env: CocultureConfig) -> CocultureConfig:
+    """Build a task of two species on the growth curves that a run has found, and with its pair.
+
+    Args: run: folder of a deployment with one reactor that holds a share, or RUN/recordings/NAME.csv of one of several.
+    Raises: UserError naming what is missing.
+    """
+    path, wanted = Path(run), None
+    if path.suffix == ".csv":
+        path, wanted = path.resolve().parents[1], path.stem
+    remedy = "give the folder of a deployment that held a share, or RUN/recordings/NAME.csv of one of its reactors"
+    try:
+        rows, _ = read_journal(path / "journal.jsonl")
+        stored = files.load_yaml(path / "config.yaml")
+    except (RecordingError, OSError, ValueError) as error:
+        raise frame.UserError(f"env_file={run}: {error}; {remedy}") from None
+    newest = {
+        row["reactor"]: row["why"]
+        for row in rows
+        if row["kind"] == "decision" and row.get("why", {}).get("bias_e") is not None
+    }
+    if wanted is None and len(newest) > 1:
+        each = ", ".join(str(path / "recordings" / f"{name}.csv") for name in newest)
+        raise frame.UserError(f"env_file={run}: several reactors, each with curves of its own; give one of {each}")
+    if not newest or wanted not in (None, *newest):
+        raise frame.UserError(f"env_file={run}: it estimated no growth curves of two species; {remedy}")
+    name, why = (wanted, newest[wanted]) if wanted else next(iter(newest.items()))
+    scales = [float(np.clip(1.0 + why[key], *SCALES)) for key in ("bias_e", "bias_p")]
+    known = [f"{scale:.3f} of the pair's" for scale in scales]
+    log.info("growth curves of %s, %s: %s and %s", path, name, *known)
+    own = stored.get("pair") if isinstance(stored, DictConfig) else None
+    pair = read_pair(str(path) if (path / FILE).is_file() else str(own or USUAL))
+    with frame.refusing(ValueError):
+        return replace(env, pair=pair, scale_e=scales[0], scale_p=scales[1])

@@ -1,0 +1,105 @@
+"""How two species enter: everything that the core lets a guest add, added here and nowhere else."""
+
+from typing import Any
+
+from conf import schema
+from dqn import policy
+from envs import scenario
+from envs.coculture.task import CocultureConfig
+from envs.scenario import Scenario
+from experiments.coculture import laws, learned, planned
+from experiments.coculture.base import SEEN, SEEN_AHEAD, SHARE
+from experiments.coculture.config import OfBenchmark, OfDeploy, OfEmulator, OfStudy, OfTrain, completed
+from experiments.coculture.program import Ratios, composed
+from experiments.coculture.run import TwoSpecies
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.control import guests
+from experiments.control.config import DeployConfig
+from experiments.laws import registry
+from experiments.laws.registry import Part
+from experiments.reporting import curves
+from experiments.reporting.curves import Chart, Curve, line
+from experiments.training import config as training
+from experiments.training.config import TrainConfig
+from hardware.family import family
+
+
+def _task(config: CocultureConfig) -> Any:
+    from experiments.coculture.task import Coculture  # torch, only where it is learned
+
+    return Coculture(config)
+
+
+needs = "needs a policy; give policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
+plans = "plans the whole program; give a scenario with ratios"
+registry.hold(SHARE, "composition", {"policy": Part(missing=needs), "program": Part(missing=plans), "pair": Part()})
+for kind, config, law, parts in (
+    ("dqn", learned.LearnedLawConfig, learned.LearnedLaw, ("policy", "pair")),
+    ("dqn_preview", learned.PreviewLawConfig, learned.LearnedLaw, ("policy", "pair")),
+    ("pi", laws.PIConfig, laws.PI, ("pair",)),
+    ("proportional", laws.ProportionalConfig, laws.Proportional, ("pair",)),
+    ("inverse_dynamics", laws.InverseDynamicsConfig, laws.InverseDynamics, ("pair",)),
+    ("bang_bang", laws.BangBangConfig, laws.BangBang, ("pair",)),
+    ("myopic", laws.MyopicConfig, laws.Myopic, ("pair",)),
+    ("midpoint", laws.MidpointConfig, laws.Midpoint, ("pair",)),
+    ("receding", planned.RecedingConfig, planned.Receding, ("pair",)),
+    ("optimum", planned.OptimumConfig, planned.Optimum, ("program", "pair")),
+):
+    registry.add(kind, config, law, "", parts, SHARE)
+for observation in (SEEN, SEEN_AHEAD):
+    policy.add(*observation)
+training.add("coculture", CocultureConfig, _task, "", completed, ("pair",))
+scenario.HEATED.append(composed)
+for to, more in (
+    (Scenario, Ratios),
+    (DeployConfig, OfDeploy),
+    (family("emulator").config, OfEmulator),
+    (TrainConfig, OfTrain),
+    (StudyConfig, OfStudy),
+    (BenchmarkConfig, OfBenchmark),
+):
+    schema.add(to, more)
+guests.add(TwoSpecies())
+curves.add(
+    units={"coculture": "of the share"},
+    curves={
+        "share/estimate": Curve("", "share of the second species as estimated"),
+        "share/low": Curve("", "lower end of the estimate's 95 % band"),
+        "share/high": Curve("", "upper end of the estimate's 95 % band"),
+        "share/setpoint": Curve("", "share asked for"),
+        "share/true": Curve("", "share in truth, which only a simulation knows"),
+        "share/fluorescence": Curve("counts", "fluorescence as measured"),
+        "controller/bias_e": Curve("", "relative error of the first species' growth curve, as estimated"),
+        "controller/bias_p": Curve("", "relative error of the second species' growth curve, as estimated"),
+        "controller/bias_e_sd": Curve("", "how unsure the first of these errors is, sd"),
+        "controller/bias_p_sd": Curve("", "how unsure the second of these errors is, sd"),
+        "controller/thermometer_error": Curve("degC", "true less measured temperature, as estimated"),
+        "controller/dose_spread": Curve("", "sd of a dose over its size, as estimated, at least as configured"),
+        "controller/dose_gain": Curve("", "dose over the dose that was asked for, as estimated"),
+        "controller/composition_od": Curve("OD", "density as the estimate of the share believes it"),
+        "controller/pigment": Curve("counts", "fluorescence of the pigment as estimated"),
+        "result/share_abs_error": Curve("", "mean error of the share, where one was asked for"),
+    },
+    columns={
+        "fluorescence": "share/fluorescence",
+        "ratio_setpoint": "share/setpoint",
+        "ratio": "share/estimate",
+        "ratio_low": "share/low",
+        "ratio_high": "share/high",
+        "true_ratio": "share/true",
+        "temperature_target_degc": "culture/temperature_target_degc",
+    },
+    called={"ratio": "share"},
+    pages={
+        "ratio": {
+            "Two species": {
+                "Share of the second species with its 95 % band": Chart(
+                    bands=[("share/estimate", "share/low", "share/high"), line("share/setpoint")]
+                ),
+                "Fluorescence, counts": Chart(["share/fluorescence"]),
+            }
+        }
+    },
+    metrics={"result/share_abs_error": "error of the share"},
+    pictures={"figures/composition": "share, temperature, OD and fluorescence of a deployment"},
+)

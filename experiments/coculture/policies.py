@@ -1,0 +1,67 @@
+"""The policy of a learned controller of the composition: finding it, and whether it was trained for what is asked."""
+
+import logging
+from pathlib import Path
+
+from dqn import policy as policies
+from dqn.policy import Policy
+from experiments.cli import frame
+from experiments.coculture.base import SHARE
+from experiments.coculture.program import Program
+from experiments.control.policies import SHIPPED, find_policy, keep, readable
+from experiments.laws import registry
+
+__all__ = ["KEPT", "SHIPPED_COMPOSITION", "check_shares", "composition_policy"]
+
+log = logging.getLogger(__name__)
+
+SHIPPED_COMPOSITION = {
+    "dqn": SHIPPED.with_name("coculture.npz"),
+    "dqn_preview": SHIPPED.with_name("coculture_preview.npz"),
+}
+"""The policy of each learned controller that comes with the program."""
+KEPT = "composition_policy.npz"  # in a run folder: the copy that all its reactors use
+
+
+def _found(name: str) -> Path:
+    """Return the path as `find_policy`; for the folder of a deployment, that of its composition policy."""
+    run = Path(name)
+    return run / KEPT if (run / "journal.jsonl").is_file() else find_policy(name)
+
+
+def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:
+    """Load the policy of a composition controller, None for one without; the run folder keeps a copy.
+
+    Args: kind: of the controller. name: `shipped`, a policy.npz or a run folder.
+    Raises: UserError naming the file and what is wrong with it.
+    """
+    if not registry.takes(kind, "policy", SHARE):
+        return None
+    kept = folder / KEPT
+    again = resumed and kept.is_file()
+    path = SHIPPED_COMPOSITION.get(kind, Path("shipped")) if name == "shipped" or again else _found(name)
+    if not again and name == "shipped" and not path.is_file():
+        remedy = "give composition_policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
+        raise frame.UserError(f"composition={kind}: no policy for it comes with this version; {remedy}")
+    with readable(path):
+        policy = policies.load(kept if again else path)
+    if not again:
+        keep(policy, kept)
+    return policy
+
+
+def check_shares(policy: Policy, kind: str, programs: list[Program], forced: bool) -> None:
+    """Whether a policy was trained for what is asked for; a share beyond that it holds at the end of its range.
+
+    Raises: UserError; forced: it is only said.
+    """
+    low, high = policy.metadata["model"]["setpoints"]
+    outside = sorted({s for p in programs for s in p.extremes if not low - 1e-9 <= s <= high + 1e-9})
+    if not outside:
+        return
+    what = f"composition={kind}: its policy was trained for shares of {low:g} to {high:g}, the scenario asks for "
+    what += ", ".join(f"{s:g}" for s in outside)
+    if not forced:
+        remedy = "give composition=midpoint, a policy trained with env.setpoints that reach there, or force_policy=true"
+        raise frame.UserError(f"{what}; {remedy}")
+    log.warning("%s; it runs all the same: force_policy=true", what)

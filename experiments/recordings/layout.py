@@ -1,0 +1,180 @@
+"""Where a recording's columns stand and what their units are, by the names or the number of its columns."""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from hardware.errors import RecordingError
+
+__all__ = ["COLUMNS", "UNITS", "Asked", "Layout", "Rows", "recognised"]
+
+Rows = tuple[int, int | None]
+
+UNITS = {"s": 1 / 60, "min": 1.0, "h": 60.0}  # min
+SPELT = {"sec": "s", "secs": "s", "seconds": "s", "mins": "min", "minutes": "min", "hr": "h", "hrs": "h", "hours": "h"}
+TIME = re.compile(r"((exp|elapsed|experiment)_)?time(_[a-z]+)?|(elapsed_)?(min|minutes|h|hours|seconds)|timestamp")
+OD = ("od_measured", "od", "od_reading", "avg_od_reading")
+PUMP = ("pump_rate_ml_s", "pump_rate")
+DUTY = "pump_{}_rate"  # the Chi.Bio writes the share of full power, not a flow
+PUMPS = (1, 2, 3, 4)
+DOSE = ("dose_ml", "add_media_ml", "add_alt_media_ml", "sum_add_media_ml", "sum_add_alt_media_ml", "volume_change_ml")
+FED = ("fed_ml",)
+TEMPERATURE = ("media_temp", "temperature_degc", "temperature_c", "avg_temperature_c", "temperature")
+REACTOR = ("reactor", "pioreactor_unit")
+LIGHT = (("fluorescence",), ("fp1_base", "fp1_emit1"))  # counts; the Chi.Bio writes the emission over the base
+COLUMNS = ("time", "od", "rate", "dose", "fed", "temperature", "reactor")  # that a user can name
+
+CHIBIO_POSITIONS = (0, 1, 8)  # of exp_time, od_measured, media_temp
+CHIBIO_FIRST_PUMP = 10  # position of pump_1_rate; the other three follow
+CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
+EVOLVER = "Experiment: "  # how the line above the two columns of an eVOLVER's files begins
+
+
+class Asked(NamedTuple):
+    """What somebody says of a file: arguments of `read_recording`."""
+
+    pump_ml_s: float
+    pumps: Sequence[int]
+    reactor: str | None
+    rows: Rows
+    columns: Mapping[str, str]
+    time_unit: str | None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where time, OD, temperature and feed stand, and the factors of time and feed to house units.
+
+    od: None in a table of doses. fed: columns of pumps that feed, or of doses. feed: what they hold: a "rate" in mL/s,
+    a "dose" in mL, the "total" of the doses so far, or nothing, "". idle: of pumps that are not counted, by number.
+    light: of the factors that make fluorescence. minutes: nan where the column's name tells no unit. labels: of words
+    that tell rows apart, by what they name: reactor, experiment, channel, event.
+    """
+
+    source: str
+    time: int
+    od: int | None
+    temperature: int | None
+    fed: tuple[int, ...]
+    feed: str
+    minutes: float
+    ml: float
+    header: list[str] | None
+    idle: dict[int, int] = field(default_factory=dict)
+    labels: dict[str, int] = field(default_factory=dict)
+    light: tuple[int, ...] = ()
+
+    @property
+    def numbers(self) -> list[int]:
+        """All columns that hold numbers, each once."""
+        some = [self.time, self.od, *self.fed, *self.idle.values(), *self.light, self.temperature]
+        return [place for place in dict.fromkeys(some) if place is not None]
+
+
+def recognised(path: Path, first: Sequence[str], named: bool, asked: Asked, doses: bool, alone: bool) -> Layout:
+    """Recognise the columns from the first line.
+
+    Args: named: that line holds names. doses: it is a table of doses beside one of readings. alone: no such table is.
+    Raises: RecordingError naming what was looked for and found.
+    """
+    if first[0].startswith(EVOLVER):
+        if alone:
+            raise RecordingError(f"{path}: an eVOLVER's OD without its pump log; give doses=.../vial0_pump_log.txt")
+        fed: tuple[int, ...] = (1,) if doses else ()
+        od, feed = (None, "dose") if doses else (1, "")
+        return Layout("eVOLVER", 0, od, None, fed, feed, UNITS["h"], asked.pump_ml_s, list(first))
+    if named:
+        return _named(path, first, asked, doses, alone)
+    if len(first) == 3:
+        return Layout("three columns without header (min, OD, mL/s)", 0, 1, None, (2,), "rate", 1.0, 1.0, None)
+    if len(first) >= CHIBIO_COMMON_COLUMNS:
+        fed, idle = _feeding(path, {pump: CHIBIO_FIRST_PUMP + pump - 1 for pump in PUMPS}, asked.pumps)
+        source = "Chi.Bio without header, columns by position"
+        return Layout(source, *CHIBIO_POSITIONS, fed, "rate", UNITS["s"], asked.pump_ml_s, None, idle)
+    raise RecordingError(
+        f"{path}: has {len(first)} columns and no header; without a header only 3 columns (minutes, OD, mL/s) or the "
+        f"Chi.Bio's own (at least {CHIBIO_COMMON_COLUMNS}) are known; add a header such as time_min,od,pump_rate_ml_s"
+    )
+
+
+def _named(path: Path, first: Sequence[str], asked: Asked, doses: bool, alone: bool) -> Layout:
+    names = [_plain(cell) for cell in first]
+    own = {key: _plain(name) for key, name in asked.columns.items()}
+
+    def found(key: str, known: Iterable[str]) -> list[str]:
+        if key not in own or (doses and key != "dose"):
+            return [name for name in known if name in names]
+        if own[key] not in names:
+            raise RecordingError(f"{path}: columns.{key} = {asked.columns[key]}: no such column; {_there(first)}")
+        return [own[key]]
+
+    def needed(key: str, what: str, known: Sequence[str]) -> str:
+        if some := found(key, known):
+            return some[0]
+        raise RecordingError(f"{path}: no column for the {what}; looked for {', '.join(known)}; {_there(first)}")
+
+    at, times = names.index, [name for name in names if TIME.fullmatch(name)]
+    time = needed("time", "time", sorted(times, key=lambda name: not _unit(name)) or ["time_min", "time_s", "time_h"])
+    od = None if doses else needed("od", "OD", OD)
+    fed, feed, ml, idle = _feed(path, names, found, asked, own)
+    if not fed and (doses or alone):
+        needed("rate", "pump rate or doses", (DUTY.format(1), *PUMP, *DOSE, *FED))
+    temperature, reactor = found("temperature", TEMPERATURE), found("reactor", REACTOR)
+    labels = {key: at(key) for key in ("experiment", "channel", "event") if key in names}
+    return Layout(
+        source="Chi.Bio CSV" if DUTY.format(1) in names else "recording with header",
+        time=at(time),
+        od=None if od is None else at(od),
+        temperature=at(temperature[0]) if temperature else None,
+        fed=fed,
+        feed=feed,
+        minutes=UNITS.get(asked.time_unit or _unit(time), math.nan),
+        ml=ml,
+        header=list(first),
+        idle=idle,
+        labels=labels | ({"reactor": at(reactor[0])} if reactor else {}),
+        light=next((tuple(map(at, columns)) for columns in LIGHT if set(columns) <= set(names)), ()),
+    )
+
+
+def _feed(
+    path: Path, names: Sequence[str], found: Callable[[str, Iterable[str]], list[str]], asked: Asked, own: Iterable[str]
+) -> tuple[tuple[int, ...], str, float, dict[int, int]]:
+    """Places and kind of what was fed, its factor to mL or mL/s, and the pumps that are not counted."""
+    duties = {pump: names.index(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
+    if duties and not {"rate", "dose", "fed"} & {*own}:
+        fed, idle = _feeding(path, duties, asked.pumps)
+        return fed, "rate", asked.pump_ml_s, idle
+    known = (("rate", "rate", (DUTY.format(1), *PUMP)), ("dose", "dose", DOSE), ("fed", "total", FED))
+    for key, feed, usual in sorted(known, key=lambda one: one[0] not in own):
+        if some := found(key, usual):
+            unit = "" if feed == "rate" else some[0].rpartition("_")[2]
+            factor = {"ul": 1e-3, "s": asked.pump_ml_s}.get(SPELT.get(unit, unit), 1.0)
+            return tuple(names.index(name) for name in some[: 1 if feed == "rate" else None]), feed, factor, {}
+    return (), "", 1.0, {}
+
+
+def _feeding(path: Path, at: dict[int, int], pumps: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
+    """Columns of the pumps that feed, and pump number -> column of the others."""
+    absent = [pump for pump in pumps if pump not in at]
+    if absent or not pumps:
+        known = ", ".join(map(str, at))
+        raise RecordingError(f"{path}: pumps = {list(pumps)}: allowed is a selection of {known}, which the file holds")
+    return tuple(at[pump] for pump in pumps), {pump: i for pump, i in at.items() if pump not in pumps}
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a time that its name tells, "" for none."""
+    words = [SPELT.get(word, word) for word in name.split("_")]
+    return "s" if name == "exp_time" else next((word for word in reversed(words) if word in UNITS), "")
+
+
+def _there(first: Sequence[str]) -> str:
+    return f"found {', '.join(first)[:120]}; name it by columns.od=NAME and the like ({', '.join(COLUMNS)})"

@@ -1,0 +1,279 @@
+"""From the cells of a recording to its columns in house units, of one reactor. Nothing is judged here."""
+
+import math
+from array import array
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.recordings import text
+from experiments.recordings.layout import Asked, Layout, recognised
+from hardware.errors import RecordingError
+
+__all__ = ["MIN_ROWS", "Cells", "named_rows", "read_table"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
+
+EPOCHS = ((1e11, 6e4, "counts ms since 1970"), (1e9, 60.0, "is a date or counts s since 1970"))  # from, per min, words
+MIN_ROWS = 10
+LARGEST_ML = 50.0  # of a dose
+SHOWN = 6  # stretches of rows that a note names
+
+
+class Cells(NamedTuple):
+    """Rows of one reactor in file order and house units; nan where a cell is no number. All have the shape (n,).
+
+    time_min: of dates and times since 1970 from the first row on. idle: shape (n, pumps not counted), mL/s.
+    number: of the row among the file's data rows. width: cells in the row. headers: how many stand between the first
+    row and this one. The others are those of `Recording`.
+    """
+
+    time_min: Array
+    od: Array
+    pump_rate: Array
+    temperature: Array
+    fluorescence: Array
+    idle: Array
+    number: Numbers
+    width: Numbers
+    headers: Numbers
+
+    def only(self, keep: Mask | Numbers) -> "Cells":
+        """Return the rows of a mask, or at positions."""
+        return Cells._make(values[keep] for values in self)
+
+
+def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -> tuple[Layout, Cells]:
+    """Read the layout of a file and its rows. Args as of `read_recording`. Raises: RecordingError."""
+    with text.readable(path):
+        export = text.zipped(path)
+    alone = doses is None and not export
+    layout, read = _loaded(path, text.READ, asked, notes, alone=alone)
+    n = len(read.width)
+    keep = np.zeros(n, dtype=np.bool_)
+    keep[slice(*asked.rows)] = True
+    keep &= _chosen(path, layout, read, asked.reactor, notes)
+    if (found := int(keep.sum())) < MIN_ROWS:
+        span = ":".join("" if end is None else str(end) for end in asked.rows)
+        of_rows = f"rows = {span}: {found} rows lie there; the file has rows 0:{n}"
+        found_all = f"only {found} data rows"
+        raise RecordingError(
+            f"{path}: {found_all if asked.rows == (0, None) else of_rows}; at least {MIN_ROWS} are needed"
+        )
+    if doses is not None and layout.feed:
+        raise RecordingError(f"{path}: holds what was fed, and doses={doses} holds it again; drop one of them")
+    table, since_1970 = _in_house_units(path, layout, read, keep, notes)
+    events = None
+    if not layout.feed:
+        events = _events(doses or path, asked, read.words(layout, "reactor", keep), since_1970, notes)
+    if layout.feed != "rate":
+        table = _with_rates(path, table, events)
+    known = table.time_min[np.isfinite(table.time_min)]
+    return layout, table._replace(time_min=table.time_min - (known[0] if since_1970 and len(known) else 0.0))
+
+
+def _loaded(
+    path: Path, tables: Sequence[str], asked: Asked, notes: list[str], doses: bool = False, alone: bool = False
+) -> tuple[Layout, "_Read"]:
+    """Read a file's layout and lines. Args as of `recognised` and of `text.cells`. Raises: RecordingError."""
+    with text.readable(path):
+        cells = text.cells(path, tables, notes)
+        first = next(cells, None)
+        if first is None:
+            raise RecordingError(f"{path}: is empty or holds no data; expected time, OD and pump rate per row")
+        named = not all(cell.strip().lower() == "nan" or not math.isnan(text.number(cell)) for cell in first)
+        layout = recognised(path, first, named, asked, doses, alone)
+        read = _read(layout, cells if layout.header else chain([first], cells))
+    if not len(read.width):
+        raise RecordingError(f"{path}: holds no complete data row; expected time, OD and pump rate in every row")
+    return layout, read
+
+
+class _Read(NamedTuple):
+    """What the lines hold, n rows. column: place -> numbers, shape (n,). width: cells of each row, shape (n,).
+
+    label: of each row, as a place in `names`, -1 where the row is cut off before it; by what it names.
+    headers: the rows before which the header is repeated.
+    """
+
+    column: dict[int, Array]
+    width: Numbers
+    label: dict[str, Numbers]
+    names: dict[str, list[str]]
+    headers: list[int]
+
+    def words(self, layout: Layout, what: str, rows: Mask) -> str | None:
+        """Return the first word that these rows hold for what is named, None where nothing names it."""
+        codes = self.label[what][rows] if what in layout.labels else np.empty(0, dtype=np.int64)
+        return self.names[what][codes[codes >= 0][0]] if (codes >= 0).any() else None
+
+
+def _read(layout: Layout, rows: Iterable[list[str]]) -> _Read:
+    columns, pick = layout.numbers, itemgetter(*layout.numbers)
+    values, width = array("d"), array("q")
+    label = {what: array("q") for what in layout.labels}
+    names: dict[str, dict[str, int]] = {what: {} for what in layout.labels}
+    headers: list[int] = []
+    for cells in rows:
+        if cells == layout.header:
+            headers.append(len(width))
+            continue
+        try:
+            values.fromlist(list(map(float, pick(cells))))
+        except (ValueError, IndexError):
+            values.fromlist([text.number(cells[i]) if i < len(cells) else math.nan for i in columns])
+        width.append(len(cells))
+        for what, place in layout.labels.items():
+            known = names[what]
+            label[what].append(known.setdefault(cells[place].strip(), len(known)) if place < len(cells) else -1)
+    table = np.asarray(values).reshape(-1, len(columns))
+    labels = {what: np.asarray(codes, dtype=np.int64) for what, codes in label.items()}
+    listed = {what: list(known) for what, known in names.items()}
+    return _Read(dict(zip(columns, table.T, strict=True)), np.asarray(width), labels, listed, headers)
+
+
+def _chosen(path: Path, layout: Layout, read: _Read, reactor: str | None, notes: list[str]) -> Mask:
+    """Find the rows of one reactor, experiment and sensor, and those that are cut off before that, (n,).
+
+    Raises: RecordingError.
+    """
+    keep = np.ones(len(read.width), dtype=np.bool_)
+    for what in ("reactor", "experiment", "channel"):
+        if what not in layout.labels:
+            continue
+        names = read.names[what] or [""]
+        here = sorted({*read.label[what][keep]} - {-1})
+        name = reactor if what == "reactor" and reactor is not None else names[here[0] if here else 0]
+        others = sorted({names[code] for code in here} - {name})
+        if name not in names:
+            raise RecordingError(
+                f"{path}: reactor = {name}: allowed is one of {', '.join(others)}, which the file holds"
+            )
+        if others and what == "experiment":
+            raise RecordingError(f"{path}: holds the experiments {name}, {', '.join(others)}; export one of them alone")
+        if others:
+            notes.append(f"{what} {name} taken; the file also holds {', '.join(others)}")
+        keep &= np.isin(read.label[what], (names.index(name), -1))
+    return keep
+
+
+def _in_house_units(path: Path, layout: Layout, read: _Read, keep: Mask, notes: list[str]) -> tuple[Cells, bool]:
+    """Return the kept rows, and whether their times count from 1970; the feed is in mL where it is no rate."""
+    column, n = read.column, len(read.width)
+    light = np.prod([column[i] for i in layout.light], axis=0) if layout.light else np.full(n, np.nan)
+    if len(layout.light) > 1:  # the Chi.Bio writes a base of 0 while its slot is off
+        light[column[layout.light[0]] == 0.0] = np.nan
+    fed = np.reshape([column[i] for i in layout.fed], (-1, n))
+    cells = Cells(
+        time_min=column[layout.time],
+        od=np.full(n, np.nan) if layout.od is None else column[layout.od],
+        pump_rate=layout.ml * (fed if layout.feed == "rate" else np.nan_to_num(fed)).sum(axis=0),
+        temperature=np.full(n, np.nan) if layout.temperature is None else column[layout.temperature],
+        fluorescence=light,
+        idle=layout.ml * np.reshape([column[i] for i in layout.idle.values()], (-1, n)).T,
+        number=np.arange(n),
+        width=read.width,
+        headers=np.searchsorted(read.headers, np.arange(n), side="right"),
+    ).only(keep)
+    if layout.feed == "total":
+        total = np.stack([column[i] for i in layout.fed])[:, keep]
+        cells = cells._replace(pump_rate=_given(path, layout.ml * total, cells))
+    minutes, since_1970 = _minutes(path, layout, cells.time_min, notes)
+    return cells._replace(time_min=minutes), since_1970
+
+
+def _given(path: Path, total: Array, cells: Cells) -> Array:
+    """Doses of running totals, (columns, n); blank cells repeat the total before. Raises: RecordingError."""
+    at = np.maximum.accumulate(np.where(np.isfinite(total), np.arange(total.shape[1]), 0), axis=1)
+    filled = np.nan_to_num(np.take_along_axis(total, at, axis=1))
+    given = np.diff(filled, axis=1, prepend=filled[:, :1]).sum(axis=0)
+    again = np.diff(cells.time_min, prepend=-np.inf) <= 0.0  # another run
+    if (falls := (given < -1e-9) & ~again).any():
+        raise RecordingError(
+            f"{path}: row {cells.number[np.argmax(falls)]}: the total that was fed falls, which no total does: are "
+            "these single doses (dose_ml), or two runs in one file (rows=FIRST:END)?"
+        )
+    return np.where(again, 0.0, given)
+
+
+def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, notes: list[str]) -> tuple[Array, Array]:
+    """Read a table of doses: minutes as of the readings, and mL, in order of time. Raises: RecordingError."""
+    layout, read = _loaded(path, text.DOSED, asked._replace(time_unit=None), notes, doses=True)
+    keep = np.ones(len(read.width), dtype=np.bool_)
+    if reactor is not None and "reactor" in layout.labels:
+        names = read.names["reactor"]
+        keep &= read.label["reactor"] == (names.index(reactor) if reactor in names else -1)
+    if "event" in layout.labels:
+        feeds = [code for code, name in enumerate(read.names["event"]) if name.startswith("add_")]
+        keep &= np.isin(read.label["event"], feeds)
+    table, dated = _in_house_units(path, layout, read, keep, [])
+    if dated != since_1970 and len(table.od):
+        raise RecordingError(f"{path}: counts its time another way than the readings; dates in both, or in neither")
+    order = np.argsort(table.time_min, kind="stable")
+    return table.time_min[order], table.pump_rate[order]
+
+
+def _with_rates(path: Path, table: Cells, events: tuple[Array, Array] | None) -> Cells:
+    """Turn doses into the mean rate from each reading to the next; rows without a reading go.
+
+    A dose counts from the next reading on; so does what a row's total has grown by.
+    """
+    is_reading = np.isfinite(table.od) & np.isfinite(table.time_min)
+    is_reading[1:] &= np.diff(table.time_min) != 0.0
+    at, readings = np.cumsum(is_reading) - 1, table.only(is_reading)
+    if len(readings.od) < MIN_ROWS:
+        raise RecordingError(f"{path}: only {len(readings.od)} rows hold a reading; at least {MIN_ROWS} are needed")
+    dose = table.pump_rate
+    if events is not None:
+        at, dose = np.searchsorted(readings.time_min, events[0], side="right") - 1, events[1]
+    _check_doses(path, dose)
+    ml = np.bincount(at[at >= 0], dose[at >= 0], len(readings.od))
+    lasts = np.append(np.diff(readings.time_min), -1.0)
+    with np.errstate(divide="ignore"):
+        rate = np.where(lasts > 0.0, ml / (60.0 * lasts), 0.0)
+    warm = np.maximum.accumulate(np.where(np.isfinite(table.temperature), np.arange(len(table.od)), 0))
+    return readings._replace(pump_rate=rate, temperature=table.temperature[warm][is_reading])
+
+
+def _check_doses(path: Path, dose: Array) -> None:
+    """Refuse volumes that are no doses. Raises: RecordingError."""
+    given = dose[dose > 0.0]
+    if len(given) and given.max() > LARGEST_ML:
+        raise RecordingError(
+            f"{path}: a dose of {given.max():g} mL: allowed {LARGEST_ML:g} mL; is it in uL, a total, or pump_ml_s?"
+        )
+    if len(given) >= MIN_ROWS and (np.diff(given) >= 0.0).all() and given[-1] > 3.0 * given[0]:
+        raise RecordingError(f"{path}: every dose is larger than the one before, as a total is; name its column fed_ml")
+
+
+def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> tuple[Array, bool]:
+    """Convert times to min, and whether they count from 1970; nan for a time of another kind."""
+    known = time[np.isfinite(time)]
+    middle = float(np.median(known)) if len(known) else 0.0
+    for floor, per_minute, words in EPOCHS:
+        if middle >= floor:
+            notes.append(f"time {words}: read as minutes from the first row on")
+            return np.where(time >= floor, time / per_minute, np.nan), True
+    if len(known) and math.isnan(layout.minutes):
+        assert layout.header is not None
+        raise RecordingError(
+            f"{path}: column {layout.header[layout.time]} holds {known.min():g} to {known.max():g}, neither dates nor "
+            "times since 1970; name its unit by time_unit=, or as time_min, time_s or time_h"
+        )
+    return np.where(time < EPOCHS[-1][0], layout.minutes * time, np.nan), False
+
+
+def named_rows(rows: Numbers) -> str:
+    """Row numbers as text, as ranges: '2 rows: 7-8'."""
+    parts = np.flatnonzero(np.diff(rows) > 1)
+    first, last = rows[np.append(0, parts + 1)], rows[np.append(parts, len(rows) - 1)]
+    spans = [f"{a}" if a == b else f"{a}-{b}" for a, b in zip(first[:SHOWN], last[:SHOWN], strict=True)]
+    shown = ", ".join(spans) + (f" and {len(first) - SHOWN} more stretches" if len(first) > SHOWN else "")
+    return f"{'row' if len(rows) == 1 else f'{len(rows)} rows:'} {shown}"

@@ -1,0 +1,124 @@
+"""A recording gone through by estimator, controller and interlock, which cannot act on it; and the loop on its twin."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.identification.screening import Series
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.laws.base import Array, Controller, Estimates
+from experiments.laws.density.estimator import Estimator
+from experiments.laws.density.estimators import WithEstimator
+from experiments.loop.loop import ClosedLoop
+from hardware.reactor import Measurement
+from hardware.safety.interlock import Interlock
+from hardware.watched import Watched
+
+__all__ = ["AHEAD", "Replayed", "replay"]
+
+AHEAD = 10  # steps
+INSIDE = 1.96  # sd of a prediction that hold 95 % of readings
+
+
+class _Recorded(Watched):
+    """A recording as a reactor. Args: series: of it, (K,). temperature: degC, (K,)."""
+
+    def __init__(self, series: Series, temperature: Array) -> None:
+        super().__init__(("recording",))
+        self._series, self._temperature, self._k = series, temperature, -1
+        self.fed_ml = 60.0 * series.pump_rate[:-1] * np.diff(series.time)
+
+    def measure(self) -> Measurement:
+        """Return the next reading; what went in before it is told by `repeated`."""
+        if self._k >= 0:
+            self.seen(self.elapsed(), self.fed_ml[self._k : self._k + 1])
+        self._k += 1
+        one = slice(self._k, self._k + 1)
+        od = self._series.od[one]
+        return Measurement(60.0 * self._series.time[one], od, self._temperature[one], np.ones(1, dtype=np.bool_))
+
+    def elapsed(self) -> float:
+        """Time of the reading, s."""
+        return float(60.0 * self._series.time[max(self._k, 0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """What happened and what would have been decided at each of K readings, (K,) each.
+
+    believed: the interlock takes the reading for the culture's. decided_ml, given_ml: doses until the next reading.
+    mu: 1/min. gain: of the pump over its setting. low, high: 95 % band in which the reading was expected `AHEAD`
+    readings before, OD, nan where nothing was. one, ten: whether a reading lay in its band, one reading and `AHEAD`
+    before, nan where that is not known. acted: the supervisor acted. reasons: of the interlock, "" for none.
+    """
+
+    setpoint: float
+    minutes: Array
+    od: Array
+    believed: NDArray[np.bool_]
+    decided_ml: Array
+    given_ml: Array
+    mu: Array
+    gain: Array
+    low: Array
+    high: Array
+    one: Array
+    ten: Array
+    acted: Array
+    reasons: tuple[str, ...]
+
+    @property
+    def doses(self) -> dict[str, float]:
+        """Per cent of the readings after which device and controller dose, neither does, or one of them alone."""
+        ours, theirs = self.decided_ml[:-1] > 0.0, self.given_ml[:-1] > 0.0  # after the last nobody looks
+        each = {
+            "both": ours & theirs,
+            "neither": ~ours & ~theirs,
+            "device": theirs & ~ours,
+            "controller": ours & ~theirs,
+        }
+        return {name: 100.0 * float(rows.mean()) for name, rows in each.items()}
+
+
+def replay(
+    series: Series, temperature: Array, law: Controller, interlock: Interlock, setpoint: float, model: EnvConfig
+) -> Replayed:
+    """Go through a recording. Doses that were decided and not given are asked for anew, never added up.
+
+    Args: series: times from 0, min. law: decides. interlock: of one reactor, with `WatchedSafety`. model: with which an
+      estimator begins beside a law that has none.
+    """
+    law = law if isinstance(law, Estimates) else WithEstimator(law, model)
+    device, n = _Recorded(series, temperature), len(series.time)
+    warm = float(np.clip(np.nanmedian(temperature), 15.0, 42.0)) if np.isfinite(temperature).any() else 37.0
+    schedule = Scenario((setpoint,), (series.time[-1] + 1.0,), (warm,))
+    loop = ClosedLoop(device, law, interlock, schedule, at_end="hold", model=model)
+    apart = np.diff(series.time, append=series.time[-1] + interlock.bench.control_min)
+    found = {key: np.full(n, np.nan) for key in ("rate", "believed", "mu", "gain", "alarm")}
+    ahead, reasons = np.full((2, n + AHEAD, 2), np.nan), []
+    for k in range(n):
+        step = loop.step()
+        known: dict[str, Any] = step.explanation | {"rate": step.rate, "believed": step.believed}
+        for key, values in found.items():
+            values[k] = known[key][0] if key in known else np.nan
+        reasons.append(step.reasons[0] or "")
+        if isinstance(law.estimator, Estimator) and known["believed"][0]:
+            steps = slice(k, min(k + AHEAD, n - 1))
+            expected = law.estimator.ahead(apart[steps], device.fed_ml[steps])
+            if len(expected):
+                ahead[0, k + 1] = expected[0]
+            if len(expected) == AHEAD:
+                ahead[1, k + AHEAD] = expected[-1]
+    believed = found["believed"] > 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs(np.log(series.od) - ahead[:, :n, 0]) / ahead[:, :n, 1]
+    one, ten = np.where(np.isfinite(off) & believed, off <= INSIDE, np.nan)
+    middle, sd = ahead[1, :n].T
+    return Replayed(
+        setpoint, series.time, series.od, believed, 60.0 * found["rate"] * apart,
+        np.append(device.fed_ml, 0.0), found["mu"], found["gain"], np.exp(middle - INSIDE * sd),
+        np.exp(middle + INSIDE * sd), one, ten, np.nan_to_num(found["alarm"]), tuple(reasons),
+    )  # fmt: skip

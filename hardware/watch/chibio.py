@@ -1,0 +1,90 @@
+"""A Chi.Bio that is only read: one GET, whose answer has the sample and what the feed pump was told since the last one.
+
+The device shows the reactor that is selected in its web page. To select one is a command, so it is not done.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hardware.chibio.messages import WrongStatus
+from hardware.chibio.protocol import FEED, DeviceState, parse_state
+from hardware.clock import Clock
+from hardware.errors import ReactorError
+from hardware.link.transport import Reply
+from hardware.messages import Fault
+from hardware.reactor import Measurement, Vitals
+from hardware.watch import messages
+from hardware.watched import Watched
+
+__all__ = ["WatchedChiBio"]
+
+AGAIN_S = 20.0  # from one `measure` without a sample to the next
+CYCLE_S = 56.0  # sooner no sample follows another
+
+
+class WatchedChiBio(Watched):
+    """One reactor that the device itself, or somebody, regulates.
+
+    Args: get: sends a GET. flow_ml_s: of its feed pump at full power. poll_s: from one look to the next.
+    """
+
+    def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float, poll_s: float) -> None:
+        super().__init__((name,))
+        self._get, self._clock, self._flow_ml_s, self._poll_s = get, clock, flow_ml_s, poll_s
+        self._began_s = self._arrived_s = clock.now()
+        self._sample_s, self._device_id = math.nan, ""
+        self._newest = np.full(5, math.nan)  # at, OD, temperature, raw, blank
+
+    def elapsed(self) -> float:
+        """See `Reactor.elapsed`."""
+        return self._clock.now() - self._began_s
+
+    def measure(self) -> Measurement:
+        """Look until there is a new sample, or for a while. Raises: nothing; trouble is in `vitals`."""
+        self._clock.sleep(max(self._arrived_s + CYCLE_S - self._clock.now(), 0.0))
+        until_s, fault, fresh = self._clock.now() + AGAIN_S, None, False
+        while not fresh and self._clock.now() < until_s:
+            self._clock.sleep(self._poll_s)
+            try:
+                fresh, fault = self._look()
+            except ReactorError as error:
+                fault = messages.NotHeardOf(error=error)
+        at, od, warm, raw, blank = self._newest[:, None]
+        age = np.full(1, self._clock.now() - self._arrived_s)
+        return Measurement(at, od, warm, np.full(1, fresh), Vitals(age, raw, (fault,), blank))
+
+    def _look(self) -> tuple[bool, Fault | None]:
+        """Whether a new sample came, and what is wrong. Raises: ReactorError."""
+        reply = self._get("/getSysdata/")
+        if reply.status != 200:
+            raise WrongStatus(request="GET /getSysdata/", status=reply.status, expected=200)
+        state, (name,) = parse_state(reply.body), self.names
+        if state.selected != name:
+            return False, messages.OtherShown(shown=state.selected, reactor=name)
+        if self._device_id not in ("", state.device_id):
+            return False, messages.OtherUnit(unit=state.device_id)
+        self._device_id = state.device_id
+        if not state.running:
+            return False, messages.NotRunning()
+        if not math.isfinite(state.sample_s) or state.sample_s == self._sample_s:
+            return False, None
+        if not math.isnan(self._sample_s):
+            self.seen(float(self._newest[0]), np.full(1, self._fed_ml(json.loads(reply.body), state)))
+        self._sample_s, self._arrived_s = state.sample_s, self._clock.now()
+        self._newest[:] = self.elapsed(), state.sample_od, state.sample_temperature, state.raw, state.blank
+        return True, None
+
+    def _fed_ml(self, data: dict[str, Any], state: DeviceState) -> float:
+        """Volume that the feed pump was told to give from the last sample to this one, by the device's own records.
+
+        A record's duty acts until the next one.
+        """
+        times, duties = (data[key].get("record", []) for key in ("time", FEED))
+        n = min(len(times), len(duties))
+        time, duty = np.array(times[len(times) - n :], dtype=float), np.array(duties[len(duties) - n :], dtype=float)
+        since = time >= self._sample_s if state.sample_s > self._sample_s else time >= state.sample_s
+        return float(self._flow_ml_s * np.sum((duty[:-1] * np.diff(time))[since[:-1]]))

@@ -1,0 +1,110 @@
+"""Recordings of other labs: does the estimator predict them, who alarms, what does calibrate say?
+
+`python -m tests.studies.recordings folder=FOLDER`, with the files at the addresses below; one page, report.html. No
+data are in the project.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.schema import check, setting
+from envs.bench import Bench
+from envs.identification.calibration import calibrate
+from envs.identification.model import NotIdentifiable
+from envs.identification.screening import Series, merged
+from envs.task import EnvConfig
+from experiments.cli import files, frame
+from experiments.recordings.reader import Recording, read_recording
+from experiments.replays.replay import replay
+from experiments.reporting.page import Page, save
+from experiments.reporting.tables import Table, number
+from hardware.errors import RecordingError
+from hardware.safety.config import SafetyConfig
+from hardware.watched import WatchedInterlock
+from tests.entry import command
+from tests.studies.supervision import shipped
+
+log = logging.getLogger(__name__)
+
+EYESPY: dict[str, Any] = {"columns": {"od": "Eyespy_sct_V", "fed": "pump_inflow_time_s"}, "pump_ml_s": 1 / 75}
+SOURCES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "lanl/chemostat_regression": ("lanl/**/example_data.csv", "its LICENSE", {}),
+    "livingphysics/bioreactor_v3": ("livingphysics/[be]*_data.csv", "none given", EYESPY),
+    "ariellangevin/eVOLVER_data-analysis": ("evolver/**/OD/*_OD.txt", "none given", {"pump_ml_s": 0.8}),
+    "gchure/diauxic_flux_parity": ("gchure/**/raw/*data.csv", "its LICENSE", {}),
+    "nahanoo/ChiBioFlow": ("chibioflow/**/*_data.csv", "its LICENSE", {}),
+}
+"""github.com/NAME: files, licence, and what `read_recording` has to be told of them."""
+FEWEST = 60  # rows
+
+
+@dataclass(frozen=True)
+class RecordingsConfig:
+    """Which recordings."""
+
+    folder: str = setting("", "with the files of each source")
+    most: int = setting(1000, "of one source", within=(1, 1000))
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def row(name: str, r: Recording) -> tuple[str, ...]:
+    """What a replay with the policy that ships and a calibration come to."""
+    raw = Series(r.time_min - r.time_min[0], r.od, r.pump_rate, r.row)
+    fast = float(np.median(np.diff(raw.time))) < 0.5
+    series = merged(raw, longest=0) if fast else raw
+    bench = Bench(period_s=round(60.0 * float(np.median(np.diff(series.time))), 3))
+    law = shipped()
+    setpoint = float(np.clip(np.nanmedian(series.od), 0.02, 1.5))
+    warm = np.interp(series.time, raw.time, r.temperature)
+    found = replay(series, warm, law, WatchedInterlock(1, SafetyConfig(), bench), setpoint, EnvConfig())
+    try:
+        result = calibrate(merged(raw))
+        said = f"{result.verdict.word}: mu {result.mu.value:.4f}, tau {result.tau.value:.3f}"
+    except NotIdentifiable as error:
+        said = f"record again: {error.why[:60]}"
+    except ValueError as error:
+        said = f"refused: {str(error)[:60]}"
+    shares = (100.0 * float(np.nanmean(v)) if np.isfinite(v).any() else None for v in (found.one, found.ten))
+    rest = 100.0 * (1.0 - found.believed.mean()), 100.0 * float((found.acted > 0.0).mean())
+    return (name, number(float(series.time[-1]) / 60.0), *map(number, (*shares, *rest)), said)
+
+
+def recordings(config: RecordingsConfig, folder: Path) -> None:
+    """A row for each recording, a table for each source."""
+    page, rows = Page("On other labs' recordings", "predicted and replayed by the policy that ships"), []
+    page.section("Recordings")
+    columns = ("recording", "h", "inside 95 %, %", "ten ahead, %", "not believed, %", "filter alarm, %", "calibrate")
+    for name, (pattern, licence, options) in SOURCES.items():
+        mine = []
+        for path in sorted(Path(config.folder).glob(pattern))[: config.most]:
+            doses = Path(str(path).replace("/OD/", "/pump_log/").replace("_OD.txt", "_pump_log.txt"))
+            more = options if doses == path else {**options, "doses": doses}
+            try:
+                r = read_recording(path, **more)
+                mine.append(row(path.stem, r) if len(r.od) >= FEWEST else (path.stem, *["–"] * 5, "too short"))
+            except RecordingError as error:
+                mine.append((path.stem, *["–"] * 5, f"refused: {str(error).partition(': ')[2][:60]}"))
+            log.info("%s", "  ".join(mine[-1]))
+        label = name.partition("/")[2]
+        page.table(Table(label, f"github.com/{name}, licence: {licence}", columns, tuple(mine)))
+        rows += [(name, *one) for one in mine]
+    if not rows:
+        raise frame.UserError(f"folder={config.folder}: holds none of {', '.join(p for p, *_ in SOURCES.values())}")
+    inside = np.array([float(one[3]) for one in rows if one[3] != "–"])
+    held = 100.0 * float(np.mean((inside >= 90.0) & (inside <= 98.0))) if len(inside) else 0.0
+    log.info("inside their band in 90 to 98 %% of readings: %.0f %% of %d recordings", held, len(inside))
+    files.write_json(folder / "summary.json", {"rows": rows, "held_pct": held, "median_pct": float(np.median(inside))})
+    save(page, folder)
+
+
+main = command(__file__, RecordingsConfig(), recordings)
+
+
+if __name__ == "__main__":
+    main()
