@@ -1,7 +1,8 @@
-"""Two species in one vial: how each grows with temperature, and the pigment of the second (docs/coculture.md, A pair).
+"""Two species in one vial: how each grows with temperature, and the pigment of the second.
 
 The default is E. coli and P. putida: Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025) and its public
-model, Janmorlock/CompEst3000: fits to batch growth between 29 and 36 degC.
+model, Janmorlock/CompEst3000: fits to batch growth between 29 and 36 degC. Another one:
+docs/coculture.md, Another pair of species.
 """
 
 from collections.abc import Callable, Mapping

@@ -21,7 +21,7 @@ from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
 
-ELSEWHERE = ("env", "agent")  # kinds that docs/tasks.md and docs/extending.md describe
+ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
 SINGULAR = {"studies": "study"}  # the others lose their s
 HEAD = """# Configuration
 

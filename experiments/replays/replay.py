@@ -10,7 +10,7 @@ from envs.identification.screening import Series
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.laws.base import Array, Controller, Estimates
-from experiments.laws.density.estimator import Estimator
+from experiments.laws.density.estimator import FIXED, Estimator
 from experiments.laws.density.estimators import WithEstimator
 from experiments.loop.loop import ClosedLoop
 from hardware.reactor import Measurement
@@ -114,7 +114,7 @@ def replay(
                 ahead[1, k + AHEAD] = expected[-1]
     believed = found["believed"] > 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(np.log(series.od) - ahead[:, :n, 0]) / ahead[:, :n, 1]
+        off = np.abs(np.log(np.maximum(series.od, FIXED.lowest_od)) - ahead[:, :n, 0]) / ahead[:, :n, 1]
     one, ten = np.where(np.isfinite(off) & believed, off <= INSIDE, np.nan)
     middle, sd = ahead[1, :n].T
     return Replayed(

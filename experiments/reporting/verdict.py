@@ -81,9 +81,9 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
     windows: Sequence[Summary] = summary["windows"]
     backend = config["backend"]["kind"]
     where = family(backend).called if backend in known() else f"the reactors of {backend}"
-    hours = summary["minutes"] / 60.0
+    hours, did = summary["minutes"] / 60.0, "only watched" if config.get("watch") else "held"
     claim = (
-        f"Deployment: {config['controller']['kind']} held {', '.join(summary['reactors'])} on {where} for "
+        f"Deployment: {config['controller']['kind']} {did} {', '.join(summary['reactors'])} on {where} for "
         f"{hours:.1f} h; {summary['outcome']}."
     )
     steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
@@ -127,7 +127,7 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items += [
         f"the first half predicts the second {a['minutes']:.0f} min ahead within {number(a['model_pct'], 2)} % rms "
         f"(the OD stays {number(a['od_stays_pct'], 2)} %, the slope goes on {number(a['same_slope_pct'], 2)} %)"
-        for a in summary["validation"].get("ahead", [])
+        for a in summary.get("validation", {}).get("ahead", ())
     ]
     against = "; ".join(summary["warnings"])
     return Headline(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")

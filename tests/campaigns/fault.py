@@ -1,7 +1,7 @@
 """What befalls a run, and what is expected of the program then: one declaration for reactors of every family.
 
 Either words are declared of which one must be told (`by`), or why no detection is needed or possible (`why_not`).
-Sources: docs/device.md, Failures; docs/biology.md, Faults; docs/pioreactor.md, What is odd in the vendor's software.
+Sources: docs/device.md, Failures; docs/biology.md, Faults; docs/pioreactor.md, Peculiarities of the vendor's software.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Simple laws on the learning task, noise-free: what docs/coculture.md, What planning brings, says of them."""
+"""Simple laws on the learning task, noise-free: what docs/coculture.md, Benefit of planning, says of them."""
 
 from collections.abc import Callable
 

@@ -189,13 +189,13 @@ def test_every_error_of_a_share_stands_under_its_own_heading_on_the_console() ->
     asked |= {"ratio_abs_error_mean": 0.031, "ratio_abs_error_last2h": 0.012, "true_ratio_abs_error_mean": 0.041}
     none = {**asked, "reactor": "M0", "ratio_abs_error_mean": math.nan}
     waves = {**asked, "reactor": "M2", "ratio_setpoint": None, "true_ratio_abs_error_mean": math.nan}
-    table = summary.shares_table([none, asked, waves])
+    table = summary.signals_table([none, asked, waves])
     heads = {"hours": "1.5-3.5", "asked": "0.400", "mean |e|": "0.031", "last 2 h": "0.012", "true |e|": "0.041"}
     heads |= {"OD |e|": "0.007"}
     assert {head: under(head, table, 1) for head in heads} == heads
-    assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M2"]
+    assert [line.split()[0] for line in table.splitlines()] == ["share", "M1", "M2"]
     assert (under("asked", table, 2), under("true |e|", table, 2)) == ("varies", "–")
-    assert summary.shares_table([none]) == ""
+    assert summary.signals_table([none]) == ""
 
 
 def step(minute: float, **told: Any) -> Step:
@@ -281,7 +281,7 @@ def curves_of(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
 
 def test_each_reactor_has_curves_of_its_own_dated_by_the_minute_of_its_sample(tmp_path: Path) -> None:
     """The interlock speaks of M0, the reading of M1 is not believed, M0 has no setpoint yet."""
-    curves = Curves(tmp_path, ("M0", "M1"), True, 0, 1e9)
+    curves = Curves(tmp_path, ("M0", "M1"), ("ratio",), 0, 1e9)
     told = {"explanation": {"mu": np.array([0.02, np.nan])}, "believed": np.array([True, False])}
     told["columns"] = {"ratio": np.array([0.3, 0.6]), "light": np.array([11.0, 12.0])}
     told |= {"od": [0.41, 0.82], "setpoint": [0.5, 0.8], "temperature": [33.0, 36.0], "phase": [-1, 0]}
@@ -325,7 +325,7 @@ def test_the_points_of_a_resumed_run_are_dated_by_the_beginning_of_its_first_lif
 def test_the_results_of_a_run_are_its_worst_error_the_sum_of_its_costs_and_the_mean_of_its_shares() -> None:
     windows = [
         {"reactor": name, "setpoint": goal, "start_min": start, "end_min": 2.0 * start, "steady_abs_error": steady,
-         "settling_min": settled, "ise": ise, "ratio_abs_error_mean": share}
+         "settling_min": settled, "ise": ise, "ratio_setpoint": 0.4, "ratio_abs_error_mean": share}
         for name, goal, start, steady, settled, ise, share in (
             ("M0", 0.5, 30.0, 0.01, 4.0, 0.2, 0.03), ("M1", 0.8, 40.0, 0.03, math.nan, 0.5, None),
             ("M1", 0.6, 50.0, None, 7.0, 0.1, 0.05),
@@ -417,7 +417,7 @@ def test_what_a_share_adds_to_a_run_has_curves_of_its_own_names(tmp_path: Path) 
         "temperature_target_degc": "culture/temperature_target_degc",
     }  # fmt: skip
     values = {key: 10.0 + k for k, key in enumerate(tags)}
-    curves = Curves(tmp_path, ("M0",), True, 0, 1e9)
+    curves = Curves(tmp_path, ("M0",), ("ratio",), 0, 1e9)
     columns = {key: np.array([value, 99.0]) for key, value in values.items()}
     curves.step(step(4.0, rows=[True, False], columns=columns))
     pictures = {}

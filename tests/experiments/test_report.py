@@ -17,6 +17,7 @@ import pytest
 from matplotlib.image import imread
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from conf import guests
 from dqn import policy as policies
 from experiments import report
 from experiments.benchmark import main
@@ -167,6 +168,7 @@ def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tm
     ]
     pair = {**entries[1], "difference": -0.1, "ci95": [-0.12, -0.05], "lower_in": 2}
     page = one_section()
+    guests.load("experiments.comparison")
     comparison.SECTIONS["share"].add(page, {"rows": entries, "paired": [pair], "figures": []}, tmp_path)
     (differences,) = (table for table in page.tables if table.name == "s_paired")
     assert differences.rows == (("b", "-0.1000 [-0.1200, -0.0500], lower in 2 of 3"),)

@@ -2,7 +2,7 @@
 
 What a job says and when (init, ready, duty, event, duty off, disconnected), who says all pins again, what a lock, a
 kill -9, a freeze, a power cut and a lost broker leave behind are those of the versions that were tried, as measured in
-the rig; docs/pioreactor.md, What is odd in the vendor's software. Written from those measurements, not from the driver.
+the rig (docs/pioreactor.md, Peculiarities of the vendor's software). Written from those measurements, not the driver.
 """
 
 import heapq

@@ -32,11 +32,11 @@ log = logging.getLogger(__name__)
 
 EYESPY: dict[str, Any] = {"columns": {"od": "Eyespy_sct_V", "fed": "pump_inflow_time_s"}, "pump_ml_s": 1 / 75}
 SOURCES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "lanl/chemostat_regression": ("lanl/**/example_data.csv", "its LICENSE", {}),
-    "livingphysics/bioreactor_v3": ("livingphysics/[be]*_data.csv", "none given", EYESPY),
-    "ariellangevin/eVOLVER_data-analysis": ("evolver/**/OD/*_OD.txt", "none given", {"pump_ml_s": 0.8}),
-    "gchure/diauxic_flux_parity": ("gchure/**/raw/*data.csv", "its LICENSE", {}),
-    "nahanoo/ChiBioFlow": ("chibioflow/**/*_data.csv", "its LICENSE", {}),
+    "lanl/chemostat_regression": ("lanl/**/example_data.csv", "LICENSE file", {}),
+    "livingphysics/bioreactor_v3": ("livingphysics/[be]*_data.csv", "no file", EYESPY),
+    "ariellangevin/eVOLVER_data-analysis": ("evolver/**/OD/*_OD.txt", "no file", {"pump_ml_s": 0.8}),
+    "gchure/diauxic_flux_parity": ("gchure/**/raw/*data.csv", "LICENSE file", {}),
+    "nahanoo/ChiBioFlow": ("chibioflow/**/*_data.csv", "LICENSE file", {}),
 }
 """github.com/NAME: files, licence, and what `read_recording` has to be told of them."""
 FEWEST = 60  # rows
