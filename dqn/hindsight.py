@@ -99,36 +99,36 @@ class ShiftRelabel:
 class ProgramRelabel:
     """The same for observations [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
 
-    x is an integrator: the change in a step depends on neither x nor the goals. So x before and after is shifted to a
-    uniformly drawn place, and a setpoint is drawn as above, near the reached x or anywhere. With an announced change,
-    the next setpoint is drawn anywhere and its time uniformly from the periods of the preview; for a fraction
-    `unannounced` nothing is announced. After the step the change is one period closer, or has happened.
+    x is an integrator: what a step adds to it (or multiplies it by) depends on neither x nor the goals. So x before and
+    after is moved to a uniformly drawn place, and a setpoint is drawn as above, near the reached x or anywhere. With an
+    announced change, the next setpoint is drawn anywhere and its time uniformly from the periods of the preview; for a
+    fraction `unannounced` nothing is announced. After the step the change is one period closer, or has happened.
 
     Args:
-      config: its keys `hindsight_*`. span: x lies within plus and minus this. spread: uniform numbers to setpoints as
-      x. reward: (x', setpoint) -> reward. column: of the setpoint. period, preview: of a decision and of the
-      announcement, in units of the time column; preview 0: there are no such columns.
+      config: its keys `hindsight_*`. place: uniform numbers to x. spread: to setpoints as x. reward: (x', setpoint) ->
+      reward. column: of the setpoint. period, preview: of a decision and of the announcement, in units of the time
+      column; preview 0: there are no such columns. scales: a step multiplies x.
     """
 
     def __init__(
         self,
         config: DQNConfig,
-        span: float,
+        place: Callable[[torch.Tensor], torch.Tensor],
         spread: Callable[[torch.Tensor], torch.Tensor],
         reward: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
         column: int,
         period: float = 1.0,
         preview: float = 0.0,
         unannounced: float = 0.2,
+        scales: bool = False,
     ) -> None:
-        self._config, self._span, self._spread, self._reward = config, span, spread, reward
+        self._config, self._place, self._spread, self._reward, self._scales = config, place, spread, reward, scales
         self._column, self._period, self._preview, self._unannounced = column, period, preview, unannounced
         self.numbers = 5 if preview else 3
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
         """Draw x after the step, a setpoint, its distance from x (infinite: anywhere), next setpoint, its time."""
-        x = self._span * (2.0 * uniform[..., 0] - 1.0)
-        parts = [x, self._spread(uniform[..., 1]), _distance(self._config, uniform[..., 2])]
+        parts = [self._place(uniform[..., 0]), self._spread(uniform[..., 1]), _distance(self._config, uniform[..., 2])]
         if self._preview:
             known = ((uniform[..., 4] - self._unannounced) / (1.0 - self._unannounced)).clamp(min=-1e-9)
             time = self._period * torch.floor(1.0 + known * (self._preview / self._period))
@@ -138,7 +138,8 @@ class ProgramRelabel:
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
         """x, setpoints, times and rewards of a batch, in place."""
         x, setpoint, distance, *announced = drawn.to(batch.s_t.dtype).unbind(-1)
-        batch.s_tm1[..., 0] += x - batch.s_t[..., 0]
+        before, after = batch.s_tm1[..., 0], batch.s_t[..., 0]
+        batch.s_tm1[..., 0] = before * (x / after) if self._scales else before + (x - after)
         batch.s_t[..., 0] = x
         low, high = self._spread(torch.tensor([0.0, 1.0])).to(x)
         near = x + distance

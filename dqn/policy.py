@@ -6,7 +6,7 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 
 | observation | what it is | actions |
 |---|---|---|
-| od, setpoint | OD x and setpoint r | pump rates, mL/s |
+| od, setpoint (, next_setpoint, minutes_to_change) | OD x, setpoint r, and its change (envs/preview.py) | mL/s |
 | error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | parts of it |
 
 `add` makes other observations known.
@@ -23,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "ABSOLUTE", "FORMAT", "RELATIVE", "Policy", "PolicyError", "add", "fingerprints", "load", "save",
+    "ABSOLUTE", "FORMAT", "PREVIEW", "RELATIVE", "Policy", "PolicyError", "add", "fingerprints", "load", "save",
 ]  # fmt: skip
 
 FORMAT = 2
 ABSOLUTE = ("od", "setpoint")
+PREVIEW = (*ABSOLUTE, "next_setpoint", "minutes_to_change")
 RELATIVE = ("error", "growth_share")
-_known: list[tuple[str, ...]] = [ABSOLUTE, RELATIVE]
+_known: list[tuple[str, ...]] = [ABSOLUTE, PREVIEW, RELATIVE]
 
 
 def add(*observation: str) -> None:

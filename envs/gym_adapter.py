@@ -13,6 +13,7 @@ __all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
+    "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
 }
 """Name -> single view, vector environment, values of the task that differ from its defaults; a guest adds its own."""
 

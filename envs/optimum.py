@@ -8,6 +8,7 @@ squared errors over the remaining k steps. Backward induction (Bellman 1957), k 
 learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -25,13 +26,14 @@ SPACING = 4.7e-4  # of log OD: eight points per action of the nominal model
 
 @dataclass(frozen=True, eq=False)
 class EpisodeOptimum:
-    """Optimal controller of one setpoint for a known number of steps.
+    """Optimal controller of setpoints that are known ahead, for as many steps.
 
-    setpoint: s, OD. log_od: uniform grid of log OD, shape (G,). factors: x(t+1) = factors[a] x(t), shape (A,).
-    value: V_k, the least sum of (x - s)^2 over k steps, each taken after the step, shape (K + 1, G).
+    setpoint: s of each step, OD, shape (K,). log_od: uniform grid of log OD, shape (G,).
+    factors: x(t+1) = factors[a] x(t), shape (A,).
+    value: V_k, the least sum of (x - s)^2 over the last k steps, each taken after the step, shape (K + 1, G).
     """
 
-    setpoint: float
+    setpoint: Array
     log_od: Array
     factors: Array
     value: Array
@@ -40,7 +42,7 @@ class EpisodeOptimum:
         """Return the best action with `left` remaining steps, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
         after = np.minimum(np.maximum(od, 1e-6)[:, None] * self.factors, MAX_OD)
         ahead = np.interp(np.log(np.maximum(after, 1e-12)), self.log_od, self.value[left - 1])
-        return np.asarray(np.argmin((after - self.setpoint) ** 2 + ahead, axis=1), dtype=np.intp)
+        return np.asarray(np.argmin((after - self.setpoint[-left]) ** 2 + ahead, axis=1), dtype=np.intp)
 
     def rollout(self, od: Array) -> tuple[Array, NDArray[np.intp]]:
         """Run K steps from the starts `od`, shape (N,); return the OD after each step and the action, each (K, N)."""
@@ -52,30 +54,32 @@ class EpisodeOptimum:
         return ods, actions
 
 
-def solve_episode(config: EnvConfig, setpoint: float, spacing: float = SPACING) -> EpisodeOptimum:
-    """Solve an episode of `config.episode_steps` steps at one setpoint for its least undiscounted cost.
+def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = SPACING) -> EpisodeOptimum:
+    """Solve an episode for its least undiscounted cost.
 
-    Args: config: the task; with its actions and integrator. setpoint: OD. spacing: of log OD.
+    Args: config: the task; with its actions and integrator. setpoint: OD, of all `config.episode_steps` steps or of
+      each of them, (K,). spacing: of log OD.
     """
-    factors = step_factors(config)
-    log_od = _reach(config, setpoint, factors, spacing)
+    factors, program = step_factors(config), np.broadcast_to(setpoint, config.episode_steps)
+    log_od = _reach(config, program, factors, spacing)
     shift = np.log(np.maximum(factors, 1e-12)) / (log_od[1] - log_od[0])
-    stage = (np.minimum(np.exp(log_od) * factors[:, None], MAX_OD) - setpoint) ** 2
-    return EpisodeOptimum(setpoint, log_od, factors, _backward(stage, shift, config.episode_steps))
+    after = np.minimum(np.exp(log_od) * factors[:, None], MAX_OD)
+    return EpisodeOptimum(program, log_od, factors, _backward([(after - s) ** 2 for s in program[::-1]], shift))
 
 
-def _backward(stage: Array, shift: Array, steps: int) -> Array:
-    """V_k = min_a [stage_a + V_{k-1} moved by shift_a], V_0 = 0, shape (steps + 1, G).
+def _backward(stages: Sequence[Array], shift: Array) -> Array:
+    """V_k = min_a [stage_k,a + V_{k-1} moved by shift_a], V_0 = 0, shape (K + 1, G).
 
-    Args: stage: cost of the step from each grid point, (A, G). shift: of each action, in grid points, (A,).
+    Args: stages: cost of each step from each grid point, the last step first, each (A, G). shift: of each action, in
+      grid points, (A,).
     """
-    points = stage.shape[1]
+    points = stages[0].shape[1]
     whole = np.floor(shift)
     part = (shift - whole)[:, None]
     whole = np.clip(whole, -points, points).astype(np.intp)
     pad = int(np.abs(whole).max()) + 1  # V is constant beyond the grid
-    value = np.zeros((steps + 1, points))
-    for before, now in pairwise(value):
+    value = np.zeros((len(stages) + 1, points))
+    for (before, now), stage in zip(pairwise(value), stages, strict=True):
         ahead = np.pad(before, pad, mode="edge")
         now[:] = np.inf
         for i, w, cost in zip(pad + whole, part, stage, strict=True):
@@ -119,18 +123,18 @@ def solve_relative(
     reach = config.largest_error + 1.0
     error = np.linspace(-reach, reach, round(2.0 * reach / spacing) + 1)
     moved = growth_share - levels
-    value = _backward((error + moved[:, None]) ** 2, moved / (error[1] - error[0]), steps)
+    value = _backward([(error + moved[:, None]) ** 2] * steps, moved / (error[1] - error[0]))
     return RelativeOptimum(growth_share, error, levels, value)
 
 
-def _reach(config: EnvConfig, setpoint: float, factors: Array, spacing: float) -> Array:
+def _reach(config: EnvConfig, program: Array, factors: Array, spacing: float) -> Array:
     """Return a grid of log OD, shape (G,), that covers every optimal episode from the scored starts.
 
     A culture that grows faster than the largest rate dilutes keeps growing, up to the limit of the environment.
     """
-    low = min(config.start_od[0], SCORED_OD[0], setpoint) * 0.8
+    low = min(config.start_od[0], SCORED_OD[0], program.min()) * 0.8
     outgrown = config.episode_steps * max(0.0, np.log(np.maximum(factors, 1e-12)).min())
-    high = np.log(max(config.start_od[1], SCORED_OD[1], setpoint) * 1.25) + outgrown
+    high = np.log(max(config.start_od[1], SCORED_OD[1], program.max()) * 1.25) + outgrown
     high = min(high, np.log(MAX_OD))
     return np.linspace(np.log(low), high, int((high - np.log(low)) / spacing) + 2)
 

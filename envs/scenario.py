@@ -35,6 +35,11 @@ class Scenario:
     recovery_od: float = setting(
         0.0, "OD to which the culture grows undiluted before the first phase; 0: no recovery", "OD", within=(0, 1.5)
     )
+    recovery: str = setting(
+        "grow",
+        "dilute: grow beyond `recovery_od` by `settled_band`, then dilute to it with full pump",
+        choices=("grow", "dilute"),
+    )
     recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
     announce_min: float | None = setting(
         None,
@@ -70,6 +75,8 @@ class Scenario:
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
+        diluted = self.recovery == "grow" or self.recovery_od > 0.0
+        require(diluted, "scenario.recovery_od", self.recovery_od, "> 0 with scenario.recovery=dilute")
         given = None not in self.temperatures or any(heated(self) for heated in HEATED)
         require(given, "scenario.temperatures", self.temperatures, "numbers where nobody else decides on them")
         for name in ("until", "outputs"):

@@ -314,7 +314,7 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
     """
 
     default = EnvConfig
-    names = ("od", "setpoint")
+    names: tuple[str, ...] = ("od", "setpoint")
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:

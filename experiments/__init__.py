@@ -1,6 +1,6 @@
-"""Commands, and the rooms they are put together from.
+"""Commands and their rooms.
 
-A file directly in this folder is a command, `python -m experiments.NAME`, and nobody imports it.
+A file directly in this folder is a command, `python -m experiments.NAME`, and is not imported.
 """
 
 from experiments.cli.start import begin

@@ -1,4 +1,4 @@
-"""The commands of the program, `python -m experiments` or `turbidostat`: what there is, and one of them."""
+"""The program `python -m experiments` or `turbidostat`: list of commands, and entry to each."""
 
 import importlib
 import sys
@@ -36,7 +36,7 @@ Exit codes
 
 
 def names() -> list[str]:
-    """Every command, in the order in which they are listed."""
+    """Return all commands, in listed order."""
     listed = [name for group in KINDS.values() for name in group]
     return [*listed, *(name for name in commands() if name not in listed)]
 
@@ -57,7 +57,7 @@ def page() -> Iterator[str]:
 
 
 def main() -> None:
-    """Entry point of the console script. Exits: as the command does; 2 for one that does not exist."""
+    """Entry point of the console script. Exits: as the command does; 2 for an unknown command."""
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h", "help"):
         print("\n".join(page()))

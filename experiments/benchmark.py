@@ -1,4 +1,4 @@
-"""Controllers side by side on simulated reactors, `python -m experiments.benchmark`: the paper and beyond it."""
+"""Compare controllers on simulated reactors: `python -m experiments.benchmark`."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from experiments.comparison.config import BenchmarkConfig
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
-    from experiments.comparison import run  # Matplotlib and SciPy, only once the config has been checked
+    from experiments.comparison import run  # Matplotlib and SciPy, only after the check of the config
 
     run.benchmark(config, folder)
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BlankConfig:
-    """Which reactors to measure, and for how long. Raises: ValueError naming key, value and allowed range."""
+    """Config of a blank measurement. Raises: ValueError with key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
     warm_up: float = setting(90.0, "longest time for the medium to reach its temperature", "min", within=(0, 600))

@@ -1,4 +1,4 @@
-"""A recording in, one trustworthy pair (mu, tau) out, as a model file for `train`: `python -m experiments.calibrate`.
+"""Fit one trustworthy pair (mu, tau) to a recording, as a model file for `train`: `python -m experiments.calibrate`.
 
 Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
 """
@@ -28,7 +28,7 @@ COLUMNS = ("time_min", "od", "pump_rate_ml_s")
 
 
 def body(config: CalibrateConfig, folder: Path) -> float | None:
-    """Calibrate, generate a recording, or study the coverage, as the config says.
+    """Calibrate, generate a recording, or study the coverage, according to the config.
 
     Returns: PMSE in % of a calibration. Raises: frame.UserError.
     """
@@ -78,7 +78,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
 
 
 def _write_twin(path: Path, behind: Twin, source: str) -> str:
-    """Write the plant; returns what to say of it. A recording may show what no plant here can do."""
+    """Write the plant; return a message about it. Some recordings are out of range for a plant."""
     try:
         text = twin_yaml(behind, source)
     except ValueError as error:
@@ -88,7 +88,7 @@ def _write_twin(path: Path, behind: Twin, source: str) -> str:
 
 
 def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: str, segment_min: float) -> None:
-    """Figures, as files and for TensorBoard, and its scalars."""
+    """Draw figures, as files and for TensorBoard, and write its scalars."""
     from experiments.reporting.calibration_charts import drift_figure, fit_figure, twin_figure
     from experiments.reporting.charts import save
     from experiments.reporting.tensorboard import Events

@@ -105,7 +105,7 @@ def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibrateP
             "the change, or lower settle_min or least_min"
         )
     if apart <= config.degree + 1:
-        log.warning("%s: a curve through all of its %d points: nothing tells how good it is; record more", name, apart)
+        log.warning("%s: a curve through all of its %d points: its error is unknown; record more", name, apart)
     value = np.array([p.growth.value for p in points])
     sd = np.hypot([p.growth.half_width / 1.96 for p in points], STRAY * value)
     return curves.fit(t, value, sd, min(config.degree, apart - 1))
@@ -149,7 +149,7 @@ def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfi
     if not marks:
         run = path.parent.parent
         how = f"python -m experiments.mark run={run} reactor={name} share=SHARE sd=SD minute=MINUTE"
-        raise frame.UserError(f"mixed={path}: no share was marked for {name} in {run}; mark some: {how}")
+        raise frame.UserError(f"mixed={path}: no marked share for {name} in {run}; mark some: {how}")
     guess = CompositionEstimatorConfig(  # the curves are those of this bench: of its thermometer, and of its pump
         factor=config.factor, offset=config.offset, od_term=config.od_term, thermometer_sd=0.0, gain_sd=0.01
     )

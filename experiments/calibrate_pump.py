@@ -43,7 +43,7 @@ class Weighing:
 
 @dataclass(frozen=True)
 class CalibratePumpConfig:
-    """What to weigh. Raises: ValueError naming key, value and allowed range."""
+    """Config of a weighing. Raises: ValueError with key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device")
     reactor: str = setting("M0", "reactor position", choices=POSITIONS)
@@ -63,7 +63,7 @@ class CalibratePumpConfig:
 
 
 def read_weighings(path: Path) -> list[Weighing]:
-    """Weighings from a CSV file with the columns duty, doses, grams. Raises: UserError naming the line."""
+    """Read weighings from a CSV file with the columns duty, doses, grams. Raises: UserError with the line."""
     try:
         with open(path, newline="", encoding="utf-8") as f:
             rows = list(csv.DictReader(f))
@@ -96,9 +96,9 @@ def _number(ask: Callable[[str], str], question: str) -> float:
 
 
 def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tuple[list[Weighing], str]:
-    """Walk the operator through all series; the weighings and the unit's identity.
+    """Guide the operator through all series; return the weighings and the unit's identity.
 
-    Args: ask: puts a question and returns the answer.
+    Args: ask: function that asks a question and returns the answer.
     Raises: ReactorError.
     """
     found = []

@@ -1,4 +1,4 @@
-"""Prove how a learned policy's closed loop behaves, and judge it: `python -m experiments.certify policy=FILE`."""
+"""Prove and judge the closed loop of a learned policy: `python -m experiments.certify policy=FILE`."""
 
 import logging
 import time
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def body(config: CertifyConfig, folder: Path) -> None:
-    """Certify one policy. Raises: frame.UserError where it cannot be read or asked, or where it is not safe."""
+    """Certify one policy. Raises: frame.UserError if it is unreadable, of an unknown kind, or not safe."""
     source = find_policy(config.policy)
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
@@ -58,12 +58,12 @@ def body(config: CertifyConfig, folder: Path) -> None:
         log.warning("policy %s: safe, a device runs it; its performance falls short: %s", source, told)
     else:
         log.info("policy %s: safe, and every requirement of performance is met", source)
-    if unwritten and config.to:  # it was asked for there
+    if unwritten and config.to:  # requested there
         raise frame.UserError(unwritten)
 
 
 def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> str:
-    """Write the certificate, its other copy, summary, figure and page. Returns: what could not be written."""
+    """Write the certificate, its other copy, summary, figure and page. Returns: the failed files."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
@@ -71,8 +71,12 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
     files.write_json(folder / "certificate.json", content, indent=None)
     unwritten = ""
     if to is None:
-        why = "a quick one stands nowhere else" if found.quick else f"{source} is part of the program, whose own stays"
-        log.info("the certificate is in the run folder alone: %s; to=FILE writes it elsewhere, too", why)
+        why = (
+            "a quick certificate is written only there"
+            if found.quick
+            else f"{source} is part of the program, whose certificate stays"
+        )
+        log.info("the certificate is in the run folder alone: %s; to=FILE also writes it elsewhere", why)
     else:
         try:
             files.write_json(to, content, indent=None)
@@ -92,7 +96,7 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
 
 
 def _place(config: CertifyConfig, source: Path) -> Path | None:
-    """Where the certificate goes beside the run folder, if anywhere. Raises: frame.UserError."""
+    """Return the certificate's place besides the run folder, if any. Raises: frame.UserError."""
     if config.to is None:
         own = source.resolve().parent == SHIPPED.resolve().parent
         return None if own or config.quick else certificate.beside(source)
@@ -103,7 +107,7 @@ def _place(config: CertifyConfig, source: Path) -> Path | None:
 
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
-    """Build what a page shows: the verdict, every requirement, and a row per case."""
+    """Build the summary: the verdict, every requirement, and a row per case."""
     kept = ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
     cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
     heads = (*content["observation"][:2], "from action", "to action")
@@ -113,7 +117,7 @@ def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[
 
 
 def _row(loop: Any, proof: Proof) -> dict[str, Any]:
-    """Summarise a case over the strips that the pump can hold; OD: of the strip in their middle."""
+    """Summarise a case over the strips that the pump can hold; OD: of the middle strip."""
     held = np.flatnonzero(proof.holdable)
     middle = held[np.abs((loop.low + loop.high)[held] / 2.0 - np.mean((loop.low[0], loop.high[-1]))).argmin()]
     return {
@@ -123,7 +127,7 @@ def _row(loop: Any, proof: Proof) -> dict[str, Any]:
         "law, largest": float(proof.law_half_width[held].max()),
         "over the law, largest": float(proof.excess[held].max()),
         "half-width in OD, middle strip": loop.in_od(proof.case, float(proof.half_width[middle])),
-        "periods after the law, largest": float(proof.later[held].max()),
+        "periods after the one-line controller, largest": float(proof.later[held].max()),
         "periods, largest": float(proof.band.periods[held].max()),
     }
 

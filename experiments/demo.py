@@ -1,7 +1,7 @@
-"""The whole way in one command, `python -m experiments.demo`: calibrate, train, certify, deploy, report.
+"""All steps in one command, `python -m experiments.demo`: calibrate, train, certify, deploy, report.
 
-Each step is the command a user would type, shown before it runs. It runs in a copy of this process that has loaded the
-libraries already, which saves most of the time that starting five programs takes.
+Each step is a command as a user types it, shown before it runs. It runs in a fork of this process with loaded
+libraries, which saves most of the start time of five programs.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from experiments.cli import stop
 
 __all__ = ["main"]
 
-FIRST = ("matplotlib.pyplot", "scipy.optimize", "experiments.calibrate")  # what the first command needs
+FIRST = ("matplotlib.pyplot", "scipy.optimize", "experiments.calibrate")  # imports of the first command
 OTHERS = (
     "torch.utils.tensorboard", "hardware.emulator.family",
     *(f"experiments.{name}" for name in ("train", "certify", "deploy", "report")),
@@ -35,7 +35,7 @@ Output files: {folder}"""
 
 
 def commands(folder: Path) -> list[list[str]]:
-    """Return the steps: the name of each command and its overrides, each with a folder of its own below `folder`."""
+    """Return the steps: the name of each command and its overrides, each with its own folder below `folder`."""
     calibrated = folder / "1_calibrate" / "calibrated.yaml"
     policy = folder / "2_train" / "policy.npz"
     steps = [  # seed 3 is within the limits after 1,800 steps; others need up to 10,000
@@ -53,7 +53,7 @@ def commands(folder: Path) -> list[list[str]]:
 
 @contextmanager
 def _held(numbers: Sequence[int]) -> Iterator[None]:
-    """Hold signals back for a moment, so that none arrives between two handlers."""
+    """Block signals briefly, so that none arrives between two handlers."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -62,7 +62,7 @@ def _held(numbers: Sequence[int]) -> Iterator[None]:
 
 
 def _run(arguments: list[str]) -> None:
-    """Be the process of one command, in a session of its own."""
+    """Run one command in this process, in its own session."""
     os.setsid()
     for number in stop.SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -74,11 +74,11 @@ def _run(arguments: list[str]) -> None:
 
 
 def step(arguments: list[str], signals: list[int]) -> int:
-    """Run one command to its end; return its exit status, or that of a stopped command.
+    """Run one command to its end; return its exit status, or the status of a stopped command.
 
-    It has a session of its own, so that a signal reaches it once, from here, however it was sent. Meanwhile this
-    process loads what later commands need.
-    Args: signals: come in here; each is passed on.
+    It has its own session, so that each signal reaches it once, from here. Meanwhile this process loads the libraries
+    of later commands.
+    Args: signals: received here and passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False
     with _held(stop.SIGNALS):
@@ -99,10 +99,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
     _, others = parser.parse_known_args()
     if others:
-        text = f"error: {others[0]}: the demo takes nothing but --help; values go to calibrate, train and deploy"
+        text = f"error: {others[0]}: the demo accepts only --help; give values to calibrate, train and deploy"
         print(text, file=sys.stderr)
         sys.exit(1)
-    folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # two demos never meet
+    folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # unique for each demo
     print(PLAN.format(folder=folder), flush=True)
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):

@@ -10,8 +10,8 @@ from experiments.control.notify import hidden
 
 
 def deploy(config: DeployConfig, folder: Path) -> None:
-    """One closed loop over the scenario."""
-    from experiments.control import run  # matplotlib and SciPy, only once the config has been checked
+    """Run one closed loop over the scenario."""
+    from experiments.control import run  # matplotlib and SciPy, only after the check of the config
 
     if config.dry_run:
         raise frame.UserError("dry_run=true: a sweep has no timetable; drop --multirun")
@@ -19,7 +19,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 class _Deploy(frame.EntryPoint[DeployConfig]):
-    """`deploy`, whose `dry_run=true` answers before there is a run folder, and whose hook's address is kept nowhere."""
+    """`deploy`: `dry_run=true` answers without a run folder, and no file has the hook's address."""
 
     def _answer(self, given: list[str]) -> None:
         given = hidden(given, os.environ)

@@ -1,7 +1,7 @@
-"""Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`.
+"""Record an event at the bench in a run's folder: `python -m experiments.mark run=RUN text=inoculated`.
 
-A level that was read off a vial is more: the run under way sets its ledger to it. So is a share of two species that was
-counted in a sample: the run under way estimates with it. So is a bottle that was filled: the run doses on from it.
+The running deployment also uses three marks: it sets its ledger to a level read from the vial, uses a counted share of
+B in its estimate, and continues dosing from a filled bottle.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ USUAL_SD = 0.03
 
 @dataclass(frozen=True)
 class MarkConfig:
-    """What happened, to which reactor of which run, and when."""
+    """Config of a mark: event, run, reactor and time."""
 
     run: str = setting("", "folder of a running or finished deployment, or `latest`")
     reactor: str = setting("", "reactor; empty: all")
@@ -61,19 +61,19 @@ class MarkConfig:
             require(bool(self.reactor), "reactor", repr(self.reactor), f"the one that {measured[0]} is of")
         if self.bottle_ml is not None:
             require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone: mark them one after the other")
-            require(self.minute is None, "minute", self.minute, "null with bottle_ml: a bottle is of now")
+            require(self.minute is None, "minute", self.minute, "null with bottle_ml, which applies now")
         if self.level_ml is not None:
             require(self.share is None, "share", self.share, "null beside level_ml: mark them one after the other")
-            require(self.minute is None, "minute", self.minute, "null with level_ml: a level is of now")
+            require(self.minute is None, "minute", self.minute, "null with level_ml, which applies now")
 
 
 def _minute_now(folder: Path, stored: Any) -> float:
-    """Return the minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
+    """Return the current minute of a run. Raises: UserError if it is over or has not begun."""
     from hardware.clock import run_time
     from hardware.family import family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
-    over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
+    over = frame.UserError(f"run={folder}: not running; give minute=MINUTE of the run")
     if kind in known() and family(kind).simulated:
         raise over
     rows, _ = read_journal(folder / "journal.jsonl")
@@ -81,12 +81,12 @@ def _minute_now(folder: Path, stored: Any) -> float:
         raise over
     if not rows:
         raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
-    speed = OmegaConf.select(stored, "backend.speed")  # an emulated device may run faster
+    speed = OmegaConf.select(stored, "backend.speed")  # an emulated device can be faster
     return run_time(rows, 1.0 if speed is None else float(speed)).s / 60.0
 
 
 def _latest(folder: Path, stored: Any) -> float:
-    """Return the minute up to which a run has come."""
+    """Return the latest minute of a run."""
     try:
         return _minute_now(folder, stored)
     except frame.UserError:
@@ -96,7 +96,7 @@ def _latest(folder: Path, stored: Any) -> float:
 
 
 def mark(config: MarkConfig) -> str:
-    """Append a mark; returns what was done, in one line. Raises: UserError naming what to give."""
+    """Append a mark; return a message of one line. Raises: UserError with the missing or invalid value."""
     folder = Path(config.run)
     known = sorted(path.stem for path in (folder / "recordings").glob("*.csv")) if config.run else []
     if not known:
@@ -109,7 +109,7 @@ def mark(config: MarkConfig) -> str:
         if minute is None:
             minute = _minute_now(folder, stored)
         elif config.share is not None and minute > (now := _latest(folder, stored)):
-            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; nobody has drawn that sample yet")
+            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; that sample is in the future")
         said = [f"level {config.level_ml:g} mL"] if config.level_ml is not None else []
         sd = None if config.share is None else USUAL_SD if config.sd is None else config.sd
         said += [f"bottle {config.bottle_ml:g} mL"] if config.bottle_ml is not None else []
@@ -119,12 +119,12 @@ def mark(config: MarkConfig) -> str:
         path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd, config.bottle_ml))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
-    taken = "; a run under way takes it over with its next sample, and says so" if said else ""
+    taken = "; a running deployment uses it with its next sample" if said else ""
     return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 
 def _quoted(argument: str) -> str:
-    """Return a text as it was typed, whatever Hydra's grammar would make of it."""
+    """Return a text as typed, quoted for Hydra's grammar."""
     key, _, value = argument.partition("=")
     if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
         return argument
@@ -133,7 +133,7 @@ def _quoted(argument: str) -> str:
 
 
 class _Mark(frame.EntryPoint[MarkConfig]):
-    """A command that works in another run's folder and needs none of its own."""
+    """A command that uses another run's folder and has none of its own."""
 
     def _answer(self, given: list[str]) -> None:
         if any(a.startswith("-") for a in given):

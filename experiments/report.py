@@ -1,4 +1,4 @@
-"""A run folder or a sweep as one self-contained HTML page, with its tables beside it.
+"""Report of a run folder or a sweep: one self-contained HTML page, and its tables.
 
 `python -m experiments.report run=RUN` shows one run, `runs=SWEEP` compares the jobs of a sweep.
 """
@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """What to report on."""
+    """Config of a report."""
 
     run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
     runs: str | None = setting(None, "the folder of a sweep, or `latest`: compare its jobs on one page; replaces run")
 
 
 def _summary(run: Path) -> Any:
-    """Read what a run found. Raises: frame.UserError for a file that holds no JSON, or half characters, or no end."""
+    """Read a run's summary. Raises: frame.UserError for a file without valid JSON."""
     try:
         summary = json.loads((run / "summary.json").read_text("utf-8"))
         json.dumps(summary, ensure_ascii=False).encode()
@@ -40,10 +40,10 @@ def _summary(run: Path) -> Any:
 
 
 def write(folder: Path) -> Path:
-    """Write report.html and tables/ into a folder; returns the page's path.
+    """Write report.html and tables/ into a folder; return the page's path.
 
-    A benchmark gets a page of its own; any other run its summary and figures; a folder of runs (as `make run` leaves
-    one) a section for each. Raises: frame.UserError where there is nothing to report on.
+    A benchmark has its own kind of page; another run its summary and figures; a folder of runs (e.g. of `make run`) a
+    section for each. Raises: frame.UserError without a run.
     """
     from experiments.comparison import page as comparison
     from experiments.record import aftermath
@@ -68,9 +68,9 @@ def write(folder: Path) -> Path:
 
 
 def compare(folder: Path) -> Path:
-    """Write report.html and tables/ into the folder of a sweep; returns the page's path.
+    """Write report.html and tables/ into the folder of a sweep; return the page's path.
 
-    Raises: frame.UserError where there is no sweep.
+    Raises: frame.UserError without a sweep.
     """
     from experiments.reporting import page, sweep_page
 
@@ -81,7 +81,7 @@ def compare(folder: Path) -> Path:
         own = [a for a in swept.arguments if not a.startswith("hydra/")] if swept else []
         expected = sweep.jobs(words.normalise(own, swept.command)) if swept else None
     except frame.UserError:
-        expected = None  # files that it named are gone: the jobs that have a folder
+        expected = None  # listed files are gone: use the jobs with a folder
     jobs = [_result(job) for job in sweep.survey(folder, expected)]
     if not jobs:
         raise frame.UserError(f"runs={folder}: holds no job of a sweep; give the folder that train -m has written")
@@ -94,7 +94,7 @@ def compare(folder: Path) -> Path:
 def _result(job: sweep.Job) -> Result:
     """Build a job's result for the page. Overrides are those of the command line, key by key."""
     overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
-    if preset := overrides.pop("hparams_search", None):  # a run of the same values is no search
+    if preset := overrides.pop("hparams_search", None):  # a single run of the same values is no search
         path = presets.ROOT / "hparams_search" / f"{preset}.yaml"
         own: Any = files.load_yaml(path) if path.is_file() else {}
         fixed = {str(k): str(v) for k, v in own.items() if k not in ("defaults", "hydra")}
@@ -108,7 +108,7 @@ def _result(job: sweep.Job) -> Result:
 
 
 def find(name: str, root: Path = Path("runs")) -> Path:
-    """Find a run folder by its path or `latest`. Raises: frame.UserError naming what to give."""
+    """Find a run folder by its path or `latest`. Raises: frame.UserError with the remedy."""
     if name != "latest":
         if not Path(name).is_dir():
             raise frame.UserError(f"run={name}: no such folder; give the folder of a finished run")
@@ -120,7 +120,7 @@ def find(name: str, root: Path = Path("runs")) -> Path:
 
 
 def report(config: ReportConfig, folder: Path) -> None:
-    """Write the report of a run; `folder` only takes the log."""
+    """Write the report of a run; `folder` is only for the log."""
     if config.runs is not None:
         log.info("report %s", compare(Path(config.runs)))
     else:

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ScoreConfig:
-    """What to score, and on which task. Raises: ValueError naming key, value and allowed range."""
+    """Config of a score: policy and task. Raises: ValueError with key, value and allowed range."""
 
     policy: str = setting("", "a policy.npz, a run folder, `latest`, or module:function of a Python file here")
     env: Any = part(EnvConfig, "the task", env_schema)
@@ -44,7 +44,7 @@ class ScoreConfig:
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A function of observations, float32 (N, O) -> action indices (N,), in the place of a `dqn.policy.Policy`.
+    """A function from observations, float32 (N, O), to action indices (N,), used like a `dqn.policy.Policy`.
 
     actions: the grid, (A,).
     """
@@ -62,7 +62,7 @@ class Function:
 
 
 def _found(name: str, task: tasks.Task) -> Any:
-    """Find what is scored. Raises: frame.UserError."""
+    """Load the scored policy or function. Raises: frame.UserError."""
     remedy = "give a policy.npz, or module:function of a Python file in this folder"
     if not name:
         raise frame.UserError(f"policy = '': nothing to score; {remedy}")
@@ -85,7 +85,7 @@ def _found(name: str, task: tasks.Task) -> Any:
 
 
 def score(config: ScoreConfig, folder: Path) -> float:
-    """Score and report; returns the regret, per cent. Raises: frame.UserError where there is nothing to score."""
+    """Score and report; return the regret, per cent. Raises: frame.UserError without a policy."""
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
 
@@ -114,7 +114,7 @@ def score(config: ScoreConfig, folder: Path) -> float:
         for name, figure in drawn.items():
             events.picture(f"figures/{name}", charts.save(figure, folder / "figures", name), 0)
     log.info("%s, %s", config.policy, task.description)
-    log.info("regret %.4g %% (the one-line law: %.4g %%)", summary["regret_pct"], summary["myopic_regret_pct"])
+    log.info("regret %.4g %% (the one-line controller: %.4g %%)", summary["regret_pct"], summary["myopic_regret_pct"])
     log.info("error at rest %.4g %s (the optimum: %.4g)", found.steady_abs_error[0], task.unit, grid.optimum_steady)
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
     return float(found.regret_pct[0])

@@ -7,8 +7,8 @@ from experiments.training.config import TrainConfig
 
 
 def train(config: TrainConfig, folder: Path) -> float:
-    """Train, export and report; returns the objective of a sweep, the merit of the worst seed."""
-    from experiments.training import run  # torch, only once the config has been checked
+    """Train, export and report; return the objective of a sweep, the merit of the worst seed."""
+    from experiments.training import run  # torch, only after the check of the config
 
     return run.train(config, folder)
 

@@ -112,7 +112,6 @@ NAMED_ALL_THE_SAME = {
     "conf.guests": "the one place where guests are registered",
     "hardware.safety.config": "the thermostat's limits are the keys composition_low and composition_high",
     "hardware.storage.marks": "a share that was counted is a column of marks.csv",
-    "experiments.mark": "and a key of the command",
 }
 
 

@@ -448,7 +448,7 @@ def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
         ("turbidostat deploy safety.resp", ["safety.responses."]), ("turbidostat demo ", ["--help"]),
         ("turbidostat calibrate --", ["--help", "--help=all", "--cfg", "--multirun"]),
         ("turbidostat certify backend", []), ("turbidostat deploy backend=em", ["backend=emulator "]),
-        ("turbidostat train agent=p", ["agent=paper "]), ("turbidostat train +env=rel", ["+env=relative "]),
+        ("turbidostat train agent=pa", ["agent=paper "]), ("turbidostat train +env=rel", ["+env=relative "]),
         ("turbidostat deploy plant.growth.temperature_l", ["plant.growth.temperature_law="]),
         ("turbidostat deploy plant.growth.temperature_law=ar", ["plant.growth.temperature_law=arrhenius "]),
         ("turbidostat deploy backend.stir", []), ("turbidostat deploy backend=chibio backend.stir", ["backend.stir="]),

@@ -21,8 +21,8 @@ from conf.schema import build, entries
 ROOT = Path(__file__).parents[1]
 ROOMS = ("conf", "dqn", "envs", "experiments", "hardware")
 ELSEWHERE = {  # not on the page: bases, and what the programs beside the commands take
-    "CocultureConfig", "ControllerConfig", "DeviceOptions", "LawConfig", "PumpCalibration", "RelativeConfig", "Source",
-    "VialConfig",
+    "CocultureConfig", "ControllerConfig", "DeviceOptions", "LawConfig", "PreviewConfig", "PumpCalibration",
+    "RelativeConfig", "Source", "VialConfig",
 }  # fmt: skip
 NUMBER = r"(-?(?:\d[\d.]*(?:e[-+]?\d+)?|inf))"
 

@@ -58,8 +58,8 @@ class FluorescenceSensor:
     g takes one step per minute. f is exact for constant p and D over the interval.
 
     Args:
-      config: the sensor; rngs: one stream per vial, for what is drawn once and for the readings.
-      pair: whose pigment it is.
+      config: the sensor; rngs: one stream per vial, for its constants and for the readings.
+      pair: the two species.
     State, shape (N,): `pigment` (counts), `production` (counts per hour and OD). Fault switches, bool, shape (N,), in
     rising precedence: `dead` (reads 0), `saturated`, `frozen`.
     """
@@ -79,7 +79,7 @@ class FluorescenceSensor:
         self._tape = Tape(reading, normals=1, uniforms=0)
 
     def reset(self, producers: Array, growth: Array, temperature: Array) -> None:
-        """Pigment and production in balance with cells that grew undiluted: f = g_ss p / mu.
+        """Set pigment and production in balance with undiluted growth: f = g_ss p / mu.
 
         Args: producers: OD of P. putida; growth: its rate, 1/min (none: no pigment); temperature: degC; shape (N,).
         """
@@ -90,7 +90,7 @@ class FluorescenceSensor:
         self._last = np.full(producers.size, np.nan)
 
     def new_minute(self, temperature: Array) -> None:
-        """Begin a minute at `temperature`, degC, shape (N,): production takes its step."""
+        """Advance production by a minute at `temperature`, degC, shape (N,)."""
         pigment = self._pair.pigment
         steady = self._pair.production(temperature)
         wanted = self.production + pigment.follow_per_h / 60.0 * (steady - self._past[0])
@@ -98,11 +98,11 @@ class FluorescenceSensor:
         self.production = np.maximum(wanted, pigment.least)
 
     def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
-        """Dilute, make and wash out pigment over an interval.
+        """Advance production and dilution of pigment over an interval.
 
         Args:
           minutes: its length, min. producers: OD of P. putida, mean of the interval.
-          kept: share that a dose at its start leaves; dilution: 1/min, during it; concentrated: by evaporation, at its
+          kept: fraction left by a dose at its start; dilution: 1/min, during it; concentrated: by evaporation, at its
             end; all of shape (N,).
         """
         gone = -np.expm1(-dilution * minutes)
@@ -111,7 +111,7 @@ class FluorescenceSensor:
         self.pigment = (self.pigment * kept * (1.0 - gone) + made) * concentrated
 
     def apparent(self, od: Array, minutes: float) -> Array:
-        """Compute what a noise-free sensor would show, counts, shape (N,).
+        """Compute the reading of a noise-free sensor, counts, shape (N,).
 
         Args: od: of all cells, shape (N,); minutes: age of the calibration, min.
         """
@@ -121,7 +121,7 @@ class FluorescenceSensor:
         return np.asarray(factor * (self.pigment + self.config.od_term * od) + d["fluorescence_offset"])
 
     def read(self, od: Array, minutes: float) -> Array:
-        """One reading with all that is configured or switched on, counts; arguments as `apparent`, shape (N,)."""
+        """Take one reading with all errors and faults, counts; arguments as `apparent`, shape (N,)."""
         c = self.config
         (z,), _ = self._tape.next()
         value = np.clip(self.apparent(od, minutes) + c.noise_sd * z, 0.0, c.saturation)

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from conf.schema import check, part, require, setting
+from envs import preview
 from envs.coculture.pair import PairConfig
 from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
@@ -119,15 +120,8 @@ def advance(config: CocultureConfig, state: Array, target: Array, minutes: float
 
 
 def passed(config: CocultureConfig, goal: Array) -> Array:
-    """Goal columns (..., 1) or (..., 3) after one decision: an announced change comes nearer, or has come.
-
-    Where nothing is announced, the next setpoint is the present one and the time 0.
-    """
-    if goal.shape[-1] == 1:
-        return goal
-    now, following, time = (goal[..., k] for k in range(3))
-    left = np.maximum(time - config.control_min, 0.0)
-    return np.stack([np.where(left > 0.0, now, following), following, left], axis=-1)
+    """Goal columns (..., 1) or (..., 3) after one decision: an announced change comes nearer, or has come."""
+    return goal if goal.shape[-1] == 1 else preview.passed(config.control_min, goal)
 
 
 def at_rest(config: CocultureConfig, x: Array, temperature: Array | float | None = None) -> Array:
@@ -186,7 +180,7 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
         goal = logit(drawn[:, 2:])
         if not c.preview_min:
             return np.concatenate([state, goal[:, :1]], axis=1)
-        time = c.control_min * (1.0 + np.floor(numbers[:, 4:] * (c.preview_min / c.control_min)))
+        time = preview.minutes_ahead(c.control_min, c.preview_min, numbers[:, 4:])
         return np.concatenate([state, goal, time], axis=1)
 
     def _advance(self, actions: NDArray[Any]) -> Array:

@@ -1,3 +1,3 @@
 """Growth rate and pump constant from a recording: screening, choice of a window, fit with intervals. Reads no file.
 
-Entered by calibrate and benchmark."""
+Calibrate and benchmark import it."""

@@ -1,4 +1,4 @@
-"""What a model predicted against what happened: growth, pump and the next reading along a run, and until when it held.
+"""Comparison of a run with its model: growth, pump and the next reading, and until when the model was right.
 
 The model is the pair (mu, tau) that a run was planned with. Three things are compared with it, segment by segment: the
 growth rate and the pump's gain, each estimated from the segment alone, and the mean error of its predictions one row
@@ -6,8 +6,8 @@ ahead,
 
     e_i = ln y_{i+1} - ln y_i - (mu - u_i/tau) dt_i,
 
-which shows what mu - u/tau misses also where a regulated culture hides the one behind the other. Its interval is that
-narrow that one segment decides; of the others two in a row have to, since one in twenty is wrong by chance.
+which shows an error of mu - u/tau even if a regulated culture does not identify mu and tau separately. Its interval is
+so narrow that one segment is enough. The other two need two segments in a row, since one in twenty is wrong by chance.
 """
 
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ LAGS = 10  # rows over which errors are correlated: noise of a reading is in two
 
 @dataclass(frozen=True)
 class Compared:
-    """A parameter along a run against the model's value; what is not identifiable in a segment is None.
+    """A parameter along a run and the model's value; None for a segment that does not identify it.
 
-    first_min, end_min, found: of each segment, in order. expected: the model's value. scale: what 10 % refer to.
-    segments: how many in a row have to exclude the model's value. line: through all, where there are enough of them.
+    first_min, end_min, found: of each segment, in order. expected: the model's value. scale: reference of the 10 %.
+    segments: number in a row that must exclude the model's value. line: through all, if they are enough.
     """
 
     name: str
@@ -48,9 +48,9 @@ class Compared:
 
     @property
     def left_min(self) -> float | None:
-        """The minute from which on the model's value is wrong, to the end of the run; None if it holds.
+        """Minute from which the model's value is wrong until the end of the run; None if it is right.
 
-        It is wrong in a segment whose interval excludes it and whose estimate is off by 10 % or more.
+        It is wrong in a segment whose interval excludes it and whose estimate differs by 10 % or more.
         """
         known = [(t, p) for t, p in zip(self.first_min, self.found, strict=True) if p is not None]
         outside = list(takewhile(lambda tp: self._wrong(tp[1]), reversed(known)))
@@ -60,12 +60,12 @@ class Compared:
         return not found.low <= self.expected <= found.high and abs(self.off_pct(found)) >= NOTABLE_DRIFT_PCT
 
     def off_pct(self, found: Parameter) -> float:
-        """By how many per cent of the scale an estimate differs from the model's value."""
+        """Return the difference of an estimate from the model's value in per cent of the scale."""
         return 100.0 * (found.value - self.expected) / self.scale
 
     @property
     def latest(self) -> Parameter | None:
-        """The last estimate that there is."""
+        """Last estimate."""
         return next((p for p in reversed(self.found) if p is not None), None)
 
 
@@ -74,8 +74,8 @@ class Agreement:
     """A run against its model.
 
     growth: mu, 1/min. gain: the pump's flow over the model's, tau_model/tau. net: mean of e per minute, 1/min.
-    predicted: OD one row ahead of the readings, nan where there is none, (n,); rms, attainable: of its error in OD, and
-    what is left of it without the mean of each segment. minutes: from the first to the last trustworthy reading.
+    predicted: OD one row ahead of the readings, nan where there is none, (n,); rms, attainable: of its error in OD,
+    with and without the mean of each segment. minutes: from the first to the last trustworthy reading.
     """
 
     series: Series
@@ -89,14 +89,14 @@ class Agreement:
 
     @property
     def left(self) -> list[Compared]:
-        """What no longer holds at the end of the run, the earliest first."""
+        """Parameters that are wrong at the end of the run, the earliest first."""
         found = [c for c in (self.growth, self.gain, self.net) if c.left_min is not None]
         return sorted(found, key=lambda c: c.left_min or 0.0)
 
     def verdict(self, planned: bool = True) -> str:
-        """One sentence: whether to calibrate again, and why.
+        """Return one sentence: whether to calibrate again, and why.
 
-        Args: planned: whether anything was decided with a model that somebody fitted; else there is none to renew.
+        Args: planned: whether the run used a calibrated model; otherwise there is none to renew.
         """
         if self.minutes < SHORTEST_WINDOW_MIN:
             return (
@@ -112,7 +112,7 @@ class Agreement:
         return f"{head}the model held to the end of the run{but}."
 
     def _which(self) -> str:
-        """Where only their balance is known to be wrong, the two that it may come from."""
+        """Return the two possible causes if only mu - u/tau is known to be wrong."""
         if self.left != [self.net] or self.net.latest is None:
             return ""
         faster, weaker = ("faster", "weaker") if self.net.latest.value > 0.0 else ("slower", "stronger")
@@ -162,7 +162,7 @@ def agreement(raw: Series, mu: float, tau: float) -> Agreement:
 
 
 def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tuple[Array, Array]:
-    """Predicted change of ln y from each row to the next, and e; e is nan without two readings in one stretch."""
+    """Return the predicted change of ln y from each row to the next, and e; nan without two readings in one stretch."""
     step = np.diff(clean.time)
     predicted = (mu - clean.pump_rate[:-1] / tau) * step
     log_od = np.log(np.where(clean.od > OD_FLOOR, clean.od, np.nan))
@@ -174,7 +174,7 @@ def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tupl
 
 
 def _mean(error: Array, time: Array) -> Parameter | None:
-    """Mean of e per minute with its 95 % interval (Newey and West 1987, Econometrica 55:703), None for too few."""
+    """Return the mean of e per minute and its 95 % interval (Newey, West 1987, Econometrica 55:703) or None."""
     seen = np.isfinite(error)
     n = int(seen.sum())
     if n < MIN_READINGS:

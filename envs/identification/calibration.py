@@ -1,8 +1,8 @@
 """From a raw recording to one trustworthy pair (mu, tau): screening, window, fit, validation and drift.
 
-A real culture changes over hours while the model's two numbers do not. So the fit is confined to the longest window
-that does not drift, what lies outside it is used to test the pair, and short segments over the whole recording show how
-the numbers wander. Two methods: `prediction_error` holds whatever moves the pump; `free_run` is the paper's.
+A real culture changes over hours, the model's two numbers do not. So the fit uses the longest window without drift. The
+rows outside test the pair, and short segments over the whole recording show the drift. Two methods: `prediction_error`
+is valid for every pump control; `free_run` is the paper's.
 """
 
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ __all__ = ["Calibration", "IdentifyConfig", "calibrate"]
 
 Array = NDArray[np.float64]
 
-FLOOR_FACTOR = 3.0  # a prediction may miss by three times what noise and disturbances do
+FLOOR_FACTOR = 3.0  # limit of a prediction error relative to noise and disturbances
 
 
 @dataclass(frozen=True)
 class IdentifyConfig:
-    """How mu and tau are estimated, how the window is chosen and what is reported."""
+    """Settings of estimation, window and report."""
 
     method: str = setting(
         "prediction_error",
@@ -60,11 +60,11 @@ class IdentifyConfig:
 def calibrate(
     series: Series, config: IdentifyConfig = IdentifyConfig(), doubts: tuple[tuple[str, str], ...] = ()
 ) -> Calibration:
-    """Fit (mu, tau) to the best window of a recording and report how far that pair can be trusted.
+    """Fit (mu, tau) to the best window of a recording and report the reliability of that pair.
 
-    Args: series: raw recording, `merged` where it has more rows than a week has minutes. doubts: about it, each with
-      what to do, for the verdict.
-    Raises: NotIdentifiable when the trustworthy rows cannot give tau; ValueError when none are left.
+    Args: series: raw recording, `merged` if it has more rows than a week has minutes. doubts: about it, each with a
+    remedy, for the verdict.
+    Raises: NotIdentifiable if the trustworthy rows do not identify tau; ValueError without such rows.
     """
     screened = _without_outliers(screen(series), config)
     along = segments(screened, config.segment_min)
@@ -133,7 +133,7 @@ def _check_between(name: str, whole: Parameter | None, alone: list[Parameter | N
 
 
 def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
-    """Without the readings that their segment's model contradicts."""
+    """Remove the readings that their segment's model contradicts."""
     clean = screened.series
     places = [place for first, end in screened.stretches for place in cuts(clean, first, end, config.segment_min)]
     places = [(a, b) for a, b in places if enough(clean.part(a, b))]
@@ -148,7 +148,7 @@ def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
 
 
 def _limit(result: Calibration, config: IdentifyConfig) -> float:
-    """PMSE that a prediction may have, %: three times what the noise makes, and disturbances where the fit has them."""
+    """Return the largest acceptable PMSE of a prediction, %: three times that of noise and estimated disturbances."""
     clean = result.screened.series
     noise = 100.0 * noise_sd(clean) ** 2 / float(np.nanmean(clean.od**2))
     if config.method == "prediction_error":
@@ -157,7 +157,7 @@ def _limit(result: Calibration, config: IdentifyConfig) -> float:
 
 
 def _free_run(inside: Series, method: str) -> Fit | None:
-    """Run the paper's fit; None where it fails and was not asked for. Raises: NotIdentifiable."""
+    """Run the paper's fit; None if it fails and was not requested. Raises: NotIdentifiable."""
     try:
         return fit(inside)
     except NotIdentifiable:

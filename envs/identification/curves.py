@@ -12,12 +12,12 @@ __all__ = ["Plateau", "Polynomial", "fit", "plateaus"]
 
 Array = NDArray[np.float64]
 
-HELD_C = 0.5  # a temperature that stays within this of its running value is held
-WIDEST, LEAST_WIDTH = 0.2, 0.03  # half width of a growth rate over its value, or in 1/h; more says nothing of a curve
-WORTH_A_WORD_MIN = 30.0  # a stretch that is longer and left out
+HELD_C = 0.5  # a temperature within this of its running mean is constant
+WIDEST, LEAST_WIDTH = 0.2, 0.03  # limit of a growth rate's half width, relative or in 1/h
+WORTH_A_WORD_MIN = 30.0  # a longer stretch that is ignored is reported
 SATURATED = 65535.0  # counts
 LIGHT_MIN = 60.0  # at the end of a plateau, over which light is averaged
-BLOCKS = 4  # of a plateau, whose growth rates tell how well their mean is known
+BLOCKS = 4  # blocks of a plateau, whose scatter gives the interval of the mean
 EDGE_ROWS = 5  # whose median is the OD at the edge of a block
 
 
@@ -39,7 +39,7 @@ class Plateau:
 class Polynomial:
     """A polynomial, coefficients highest power first, of T - centre.
 
-    off: of each point from it, in sds.
+    off: distance of each point from it, in sds.
     """
 
     coefficients: tuple[float, ...]
@@ -55,13 +55,13 @@ def plateaus(
     least_min: float,
     offset: float = 0.0,
 ) -> tuple[list[Plateau], list[str]]:
-    """Every stretch of a recording in which the temperature was held, behind the time in which growth settles.
+    """Return every stretch of constant temperature in a recording, after the time in which growth settles.
 
-    Growth is what the OD gained and the pump removed, mu = (ln y_end - ln y_start + sum u dt / tau) / minutes, the mean
-    of four blocks, with the interval that their scatter leaves. So the curves are as right as the pump's flow; where
-    they cross does not depend on it. Light per OD is the mean over the last hour, less the offset. What is shorter than
-    `least_min`, or tells growth to less than 20 % and .03 1/h, is left out; the second list says of each such stretch
-    that took half an hour or more what it lacked.
+    Growth is the increase of ln OD plus dilution, mu = (ln y_end - ln y_start + sum u dt / tau) / minutes, the mean
+    of four blocks, with an interval from their scatter. So the curves depend on the pump's flow; their crossing does
+    not. Light per OD is the mean over the last hour, less the offset. A stretch shorter than `least_min`, or with a
+    growth rate uncertain by more than 20 % and .03 1/h, is ignored. The second list has the reason for each ignored
+    stretch of half an hour or more.
     Args: temperature: degC; light: counts; nan where there is none, (n,). tau: V/60 of the calibrated flow.
     """
     found: list[Plateau] = []
@@ -92,7 +92,7 @@ def plateaus(
 
 
 def _growth(part: Series, tau: float) -> Parameter | None:
-    """Growth rate of a stretch, 1/h; None where it has too few readings, or did not grow."""
+    """Return the growth rate of a stretch, 1/h; None with too few readings or without growth."""
     seen = np.flatnonzero(part.od > 0.0)
     if seen.size < BLOCKS * 2 * EDGE_ROWS:
         return None
@@ -111,7 +111,7 @@ def _growth(part: Series, tau: float) -> Parameter | None:
 
 
 def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
-    """[first, end) of every stretch in which the temperature stays within `HELD_C` of its mean so far."""
+    """Return [first, end) of every stretch in which the temperature stays within `HELD_C` of its mean so far."""
     found, first, total, count = [], 0, 0.0, 0
     for k, t in enumerate(temperature):
         if np.isnan(t):

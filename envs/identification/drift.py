@@ -1,4 +1,4 @@
-"""How mu and tau wander along a recording: short segments fitted alone, and a line through their estimates."""
+"""Drift of mu and tau along a recording: separate fits of short segments, and a line through their estimates."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,7 +23,7 @@ SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A short fit of its own: positions [first, end), its middle in min, and what it gave; None = not identifiable."""
+    """A short separate fit: positions [first, end), its middle in min, and its estimates; None: not identifiable."""
 
     first: int
     end: int
@@ -53,12 +53,12 @@ class Drift:
 
     @property
     def notable(self) -> bool:
-        """Significant, and 10 % or more between the ends."""
+        """Whether it is significant and 10 % or more between the ends."""
         return self.significant and abs(self.change_pct) >= NOTABLE_DRIFT_PCT
 
 
 def pairs(parts: list[Series]) -> list[Pair]:
-    """(mu, tau) of each series, None for what it does not show; a series without dilution gives mu only."""
+    """Estimate (mu, tau) of each series, None if not identifiable; a series without dilution gives mu only."""
     found: list[Pair] = []
     for e in estimate(parts, QUICK) if parts else []:
         known = e.condition < WORST_CONDITION and _narrow(e.mu)
@@ -82,7 +82,7 @@ def cuts(clean: Series, a: int, b: int, length: float) -> list[tuple[int, int]]:
 
 
 def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
-    """Independent fits along the recording, of about `length` min; a segment whose pump never ran gives mu alone."""
+    """Fit segments of about `length` min separately; a segment whose pump never ran gives mu only."""
     clean = screened.series
     places = [place for first, end in screened.stretches for place in cuts(clean, first, end, length)]
     places = [(a, b) for a, b in places if enough(clean.part(a, b))]
@@ -96,8 +96,8 @@ def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
 def drifts(along: tuple[Segment, ...]) -> bool:
     """Tell whether tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
 
-    Growth that wanders is part of the model and mu its mean. Less certainty than for a warning: a window that may drift
-    is not to be trusted (docs/records/calibration.md, The window, shows what either rule brings).
+    Fluctuating growth is part of the model and mu its mean. The rule is stricter than that of a warning, because a
+    window must not drift (docs/records/calibration.md, The window, compares both rules).
     """
     mu, tau = drift(along, [s.mu for s in along]), drift(along, [s.tau for s in along])
     return _steps([s.mu for s in along if s.mu is not None]) or any(
@@ -109,10 +109,10 @@ def drifts(along: tuple[Segment, ...]) -> bool:
 
 
 def _steps(found: list[Parameter]) -> bool:
-    """Whether the estimates before some place differ by a third from those after it, beyond what scatters.
+    """Return whether the estimates before some place differ by a third from those after it, beyond their scatter.
 
-    One that is not known within a third counts for nothing: in a culture that is held at one OD such ones all err to
-    one side.
+    An estimate that is uncertain by more than a third is ignored: at constant OD such estimates are all biased to one
+    side.
     """
     found = [p for p in found if p.half_width < WANDERING_PCT / 100.0 * p.value]
     value = np.array([p.value for p in found])
@@ -129,7 +129,7 @@ def _steps(found: list[Parameter]) -> bool:
 
 
 def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift | None:
-    """Line through at least four estimates, weighted by their intervals; scatter beyond them widens the slope's."""
+    """Fit a line through at least four estimates, weighted by their intervals; scatter widens the slope's."""
     from scipy.special import stdtrit
 
     known = [(s.middle_min, v) for s, v in zip(along, values, strict=True) if v is not None]

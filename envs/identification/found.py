@@ -1,4 +1,4 @@
-"""What a calibration leaves: the pair with its intervals, all that was found beside it, and what to do with it."""
+"""Result of a calibration: the pair with its intervals, all other findings, and the verdict."""
 
 from dataclasses import dataclass
 
@@ -26,19 +26,19 @@ class Verdict:
     then: str
 
     def line(self) -> str:
-        """As it stands on the screen."""
+        """Line on the screen."""
         return f"{self.word}: {self.why}" + (f"; {self.then}" if self.then else "")
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Everything `calibrate` found. Positions refer to `screened.series`; window is [first, end).
+    """Result of `calibrate`. Positions refer to `screened.series`; window is [first, end).
 
-    mu, tau: the returned pair, by `method`. estimate, free_run: of the window by either method, None where there is no
-    such fit; sound: whether the estimate tells tau. model: free run of the returned pair over the window from the start
+    mu, tau: the returned pair, by `method`. estimate, free_run: of the window by either method, None without such a
+    fit; sound: whether the estimate identifies tau. model: free run of the returned pair over the window from the start
     that fits best, OD, shape (n,). pair_pmse_pct: its PMSE. pmse_pct: of the free-run fit, the paper's figure; of the
     pair where there is no such fit.
-    warnings: what speaks against the pair, the gravest first.
+    warnings: reasons against the pair, the most serious first.
     """
 
     screened: Screened
@@ -62,7 +62,7 @@ class Calibration:
 
     @property
     def inside(self) -> Series:
-        """The window's rows."""
+        """Rows of the window."""
         return self.screened.series.part(*self.window)
 
     @property

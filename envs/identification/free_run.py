@@ -1,8 +1,8 @@
-"""The paper's fit: least squares on the OD of a trajectory that runs freely from a fitted start.
+"""The paper's fit: least squares of a free trajectory from a fitted start.
 
-For open-loop recordings. Its intervals allow for correlated errors of the readings; where the pump answers the readings
-or doses and growth vary, estimates are shrunk and intervals too narrow (docs/calibration.md, Method).
-Pure functions of arrays; no file, no clock, no random numbers.
+For open-loop recordings. Its intervals allow for correlated errors of the readings; if the pump responds to the
+readings, or doses and growth vary, estimates are too small and intervals too narrow (docs/calibration.md, Method). Pure
+functions of arrays; no file, no clock, no random numbers.
 """
 
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ HUBER_SD = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted pair and how well it describes its rows.
+    """A fitted pair and the quality of its fit.
 
-    mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s; None where only mu was fitted.
+    mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s; None if only mu was fitted.
     start_od: fitted OD at the first row.
     model: simulated OD, shape (n,). pmse_pct, rms: see `pmse`; root mean square of the residuals, OD.
     n_used: readings fitted. autocorrelation: of the residuals at lag 1.
@@ -55,14 +55,14 @@ def _basis(series: Series, used: NDArray[np.intp], with_tau: bool) -> Array:
 
 
 def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Levenberg-Marquardt with the exact derivatives; Huber's loss by reweighting.
+    """Solve by Levenberg-Marquardt with the exact derivatives and Huber's loss by reweighting.
 
-    A reading counts in full up to 3 robust sd, the larger of that of the residuals and that of the relative residuals
-    times the model, so that the noisier readings at a high OD are not taken for outliers.
+    A reading has full weight up to 3 robust sd: the larger of the sd of the residuals, and of the relative residuals
+    times the model. So noisier readings at a high OD are not outliers.
 
     Returns: parameters (p,), derivatives of the model (m, p), residuals model - y clipped by the loss and where, (m,).
     """
-    from scipy.optimize import least_squares  # half a second, which a refused command line need not wait for
+    from scipy.optimize import least_squares  # takes half a second, which a refused command should not
 
     size = np.maximum(y, OD_FLOOR)
     best = np.linalg.lstsq(basis * size[:, None], np.log(size) * size, rcond=None)[0]  # sd of ln y is sd(y) / y
@@ -95,17 +95,17 @@ def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, N
 
 
 def fit(series: Series, robust: bool = True) -> Fit:
-    """Least squares of the simulated OD on the readings: sum rho(x_i - y_i) over mu, 1/tau and ln x_0.
+    """Fit the simulated OD to the readings: minimise sum rho(x_i - y_i) over mu, 1/tau and ln x_0.
 
     rho is the square, beyond 3 robust sd linear (Huber). Intervals come from the sandwich covariance
     H^-1 S H^-1 with S the long-run covariance of the scores (see `_sum_variance`), so that correlated and uneven
     errors widen them, each residual divided by 1 - leverage (the jackknife's correction, MacKinnon & White 1985, J.
-    Econom. 29:305), and Student's t with the degrees of freedom of the effective number of readings. The interval
-    of tau is that of 1/tau turned over.
+    Econom. 29:305), and Student's t with the degrees of freedom of the effective number of readings. The interval of
+    tau is the inverted interval of 1/tau.
 
     Args:
       series: readings may be nan; time and pump rate count throughout.
-      robust: False is plain least squares.
+      robust: False: plain least squares.
     Returns: see `Fit`; tau is None when the pump never runs.
     Raises: NotIdentifiable when the readings are too few or the interval of 1/tau reaches zero.
     """
@@ -123,7 +123,7 @@ def fit(series: Series, robust: bool = True) -> Fit:
     inverse = np.linalg.inv(normal)
     leverage = np.minimum(np.einsum("ij,jk,ik->i", jacobian, inverse, jacobian), 0.5)
     score = jacobian * (error / (1.0 - leverage))[:, None]
-    influence = inverse @ score.T  # (p, m): how far each reading pulled a parameter
+    influence = inverse @ score.T  # (p, m): influence of each reading on a parameter
     mu = Parameter(*_interval(best[0], influence[0], len(best)))
     tau = _turned_over(series, _interval(best[1], influence[1], len(best))) if with_tau else None
     rate, start_od = 1.0 / best[1] if with_tau else np.inf, float(np.exp(best[-1]))
@@ -153,13 +153,13 @@ def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Paramet
 
 
 def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float, float, float]:
-    """Value and 95 % interval from the influence of each reading, shape (m,), in the order of time.
+    """Return the value and 95 % interval from the influence of each reading, shape (m,), in order of time.
 
-    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`, but never below sum z^2: readings that repel one another are
-    an accident of a short record. Few readings at a high OD carry most of the information and correlated ones repeat
-    each other, so V is itself uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after
-    Satterthwaite's effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their
-    correlation is estimated from the same readings. docs/records/calibration.md measures the coverage.
+    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`, but at least sum z^2, because negative correlation is an
+    accident of a short record. A few readings at a high OD have most of the information, and correlated readings repeat
+    each other, so V is uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after Satterthwaite's
+    effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their correlation is
+    estimated from the same readings. docs/records/calibration.md measures the coverage.
     """
     from scipy.special import stdtrit
 
@@ -172,7 +172,7 @@ def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float,
 
 
 def _sum_variance(z: Array) -> float:
-    """Variance of sum z_i for a serially correlated z of mean 0, shape (m,).
+    """Estimate the variance of sum z_i for a serially correlated z of mean 0, shape (m,).
 
     Newey-West type estimate: AR(1) prewhitening, quadratic spectral kernel, automatic bandwidth
     1.3221 (4 rho^2/(1 - rho)^4 m)^(1/5) (Andrews 1991, Econometrica 59:817; Andrews & Monahan 1992, 60:953).

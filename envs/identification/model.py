@@ -1,4 +1,4 @@
-"""The model of a recording and what every fit of it shares: the trajectory, PMSE, estimates, when tau can be seen.
+"""The model of a recording and common parts of its fits: trajectory, PMSE, estimates, identifiability of tau.
 
 With u held from each row to the next, equation (5) of the paper has the exact solution
 
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 MIN_READINGS = 20
 CONFIDENCE = 0.95
 WORST_CONDITION = 1e8  # of scaled normal equations
-WIDEST = 0.5  # half width of an interval over its value; what is wider is no measurement
-MIN_STEPS = 3  # rows at a low and at a high pump rate that a fit of tau needs
+WIDEST = 0.5  # largest half width of an interval over its value
+MIN_STEPS = 3  # rows at a low and at a high pump rate, needed for tau
 
 
 REMEDY = (
@@ -32,7 +32,7 @@ REMEDY = (
 
 
 class NotIdentifiable(ValueError):
-    """The rows cannot tell the parameters: why, and what recording could."""
+    """Error of rows that do not identify the parameters: reason, and a better recording."""
 
     def __init__(self, why: str, remedy: str = REMEDY) -> None:
         super().__init__(f"{why}; {remedy}")
@@ -76,10 +76,10 @@ def pmse(od: Array, model: Array) -> float:
 
 
 def check_excitation(series: Series) -> None:
-    """Refuse rows in which the pump cannot have told dilution from growth.
+    """Refuse rows in which dilution and growth cannot be distinguished.
 
-    tau shows only where the pump rate changes: without any feed 1/tau multiplies zero, and with a constant one only
-    mu - u/tau can be seen. The lowest and the highest two rates may be odd rows and count for nothing.
+    Only a changing pump rate identifies tau: without feed 1/tau multiplies zero, and with a constant rate only mu -
+    u/tau is identified. The two lowest and the two highest rates may be odd rows and are ignored.
 
     Raises: NotIdentifiable.
     """
@@ -103,6 +103,6 @@ def check_excitation(series: Series) -> None:
 
 
 def start_level(series: Series, mu: float, tau: float, readings: int = 5) -> float:
-    """OD at the first row that the first few readings point to under known (mu, tau); median, so one may be wrong."""
+    """Estimate the OD at the first row by a median of the first readings under known (mu, tau)."""
     ratio = series.od / trajectory(series.time, series.pump_rate, mu, tau, 1.0)
     return float(np.median(ratio[np.isfinite(ratio)][:readings]))

@@ -1,4 +1,4 @@
-"""The noise model of a recording, and its average: adaptive multiple importance sampling over what nobody measured.
+"""The noise model of a recording, averaged by adaptive multiple importance sampling over its unknown parameters.
 
 A point of the noise model is drawn from seven independent standard normals z, so that the prior of each number is a
 function of its z and no number has an edge:
@@ -30,9 +30,9 @@ __all__ = ["FULL", "QUICK", "NoiseModel", "average", "effective"]
 Array = NDArray[np.float64]
 
 FULL = 10 * (128,)  # points of each round
-QUICK = (128, 64, 64)  # where many short series are estimated and an interval decides nothing alone
+QUICK = (128, 64, 64)  # for many short series whose single intervals decide nothing
 TAIL = 5  # degrees of freedom of a proposal
-FEWEST_EFFECTIVE = 24  # points that a proposal is fitted to
+FEWEST_EFFECTIVE = 24  # least effective points for the fit of a proposal
 LEAST_SPREAD = 0.01  # sd of a proposal in each direction, of the prior's
 
 
@@ -55,7 +55,7 @@ class NoiseModel:
 
         p, dose, wander, memory, phi, late, again = np.moveaxis(z, -1, 0)
         p, late, again = (np.clip(1.5 * ndtr(share) - 0.25, 0.0, 1.0) for share in (p, late, again))
-        late = late**2  # small shares are drawn often enough to be found between the atom and the rest
+        late = late**2  # draws enough small values between the atom and the rest
         return cls(
             p=p,
             dose=0.3 * np.exp(1.7 * dose),
@@ -71,7 +71,7 @@ def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...
     """Points of the noise model and their weights for each of M series.
 
     Args: score: logarithm of the likelihood at z, (M, g, 7) -> (M, g). series: M. rounds: points of each; the first are
-      drawn from the prior. seed: of the draws, the same for every series, so that none depends on those beside it.
+      drawn from the prior. seed: of the draws, the same for every series, so that series are independent.
     Returns: z (M, G, 7) and weights (M, G) that sum to 1.
     """
     rng, d = np.random.default_rng(seed), len(fields(NoiseModel))
@@ -96,14 +96,14 @@ class _Student:
     degrees: float
 
     def draw(self, rng: np.random.Generator, points: int) -> Array:
-        """Shape (M, points, 7)."""
+        """Draw points, shape (M, points, 7)."""
         step = rng.standard_normal((points, self.centre.shape[1]))
         if np.isfinite(self.degrees):
             step *= np.sqrt(self.degrees / rng.chisquare(self.degrees, (points, 1)))
         return np.asarray(self.centre[:, None] + step @ self.root.swapaxes(-1, -2))
 
     def log_density(self, z: Array) -> Array:
-        """Up to a constant that all of one kind share, of z (M, G, 7): shape (M, G)."""
+        """Return the log density of z (M, G, 7) up to a constant, shape (M, G)."""
         from scipy.special import gammaln
 
         away = np.linalg.solve(self.root, (z - self.centre[:, None]).swapaxes(-1, -2))
@@ -131,12 +131,12 @@ def _normalised(log_weight: Array) -> Array:
 
 
 def effective(weight: Array) -> Array:
-    """How many points of equal weight are worth the same, 1 / sum w^2 (Kish 1965), shape (M,)."""
+    """Return the effective number of points, 1 / sum w^2 (Kish 1965), shape (M,)."""
     return np.asarray(1.0 / np.sum(weight**2, axis=1))
 
 
 def _tempered(log_weight: Array) -> Array:
-    """Weights to the largest power up to 1 that leaves FEWEST_EFFECTIVE effective points."""
+    """Raise weights to the largest power up to 1 that leaves FEWEST_EFFECTIVE effective points."""
     chosen = _normalised(log_weight)
     for power in np.geomspace(0.8, 1e-6, 60):
         thin = effective(chosen) < FEWEST_EFFECTIVE

@@ -1,8 +1,8 @@
-"""Growth rate mu and dilution constant tau by the prediction-error method: unbiased also when the pump answers the OD.
+"""Growth rate mu and dilution constant tau by the prediction-error method: also unbiased under feedback.
 
-A free run from one start takes every disturbance for noise of the sensor. Under feedback the pump answers to those
-disturbances, pump and error are correlated, and least squares shrinks mu and 1/tau. Here the model has the disturbances
-in it, and each reading is compared with what all readings before it say about it:
+A free run from one start treats every disturbance as sensor noise. Under feedback the pump answers those disturbances,
+pump and error are correlated, and least squares shrinks mu and 1/tau. Here the model contains the disturbances, and
+each reading is compared with its prediction from all earlier readings:
 
     ln y_i = b + mu t_i - k (C_i - q l_i) + s_i + sigma r_i v_i       k = 1/tau, c_i = u_i dt_i, C_i = sum_{j<i} c_j
     l_i = c_{i-1} + h l_{i-1}                                         doses that mix late, late share q, h of it again
@@ -11,11 +11,11 @@ in it, and each reading is compared with what all readings before it say about i
     v_{i+1} = phi v_i + sqrt(1 - phi^2) nu_i                          reading noise, correlated from row to row
 
 with xi, eta, nu independent standard normal, r^2 = p + (1 - p)(x_mean/x)^2 (p = 1: noise in proportion to the OD, 0:
-as large at every OD; x is a running median, never the reading itself). A rate chosen from reading i acts from row i
-on. For given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1,
-t and -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville
-1974, Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is
-no optimiser and no local minimum (docs/calibration.md, Method).
+as large at every OD; x is a running median, never the reading itself). A rate decided from reading i acts from row i
+on. For given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1, t
+and -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville
+1974, Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is no
+optimiser and no local minimum (docs/calibration.md, Method).
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ __all__ = ["Estimate", "Quality", "enough", "estimate", "outliers"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LEVEL_ROWS = 5  # of the running median that stands for the OD level
+LEVEL_ROWS = 5  # width of the running median of the OD level
 COLUMNS = 4  # ln y, 1, t, -C
 MU, K = 1, 2  # positions among the three regressors
 STRATA = 64  # of each point's Student t
@@ -43,9 +43,9 @@ OUTLIER_SD = 4.5
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """M series padded to n rows: what the filter walks over. Shapes (M, n), columns (M, n, 3).
+    """M series padded to n rows, input of the filter. Shapes (M, n), columns (M, n, 3).
 
-    reading: True where there is one. dt: min to the next row, 0 in the padding. each: c. rms: c_rms, (M,). level:
+    reading: whether there is one. dt: min to the next row, 0 in the padding. each: c. rms: c_rms, (M,). level:
     x / x_mean. columns: ln y, 1 and t. volume: C. scale: (M, 3), by which each regressor is divided. span: min between
     first and last row, (M,). mean_od: of the running median, (M,).
     """
@@ -69,7 +69,7 @@ class _Batch:
 
 
 def enough(part: Series) -> bool:
-    """Whether a series has the readings that an estimate needs."""
+    """Return whether a series has enough readings for an estimate."""
     return int((part.od > OD_FLOOR).sum()) >= FEWEST_READINGS
 
 
@@ -105,7 +105,7 @@ def _batch(parts: list[Series]) -> _Batch:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One row of the filter: gain (4, M, G) before the row's own motion, variance (M, G), innovation (4, M, G)."""
+    """One row of the filter: gain (4, M, G) before the transition, variance (M, G), innovation (4, M, G)."""
 
     gain: Array
     variance: Array
@@ -175,7 +175,7 @@ class _Filter:
         covariance[2, 2] += self._fresh[1]
 
     def _meet(self, decay: Array) -> None:
-        """Prepare what a row keeps of w and v, and the variance of what is added to them."""
+        """Prepare the decay of w and v in a row, and the variance of their noise."""
         kept = np.stack([np.ones(self.shape), decay, self.cells.phi, np.ones(self.shape)])
         self._kept[:, :4] = kept[:, None] * kept
         self._kept[:, 4:] = kept[:, None]
@@ -210,7 +210,7 @@ def _solve(batch: _Batch, cells: NoiseModel) -> _Solved:
     gram = np.moveaxis(products, (0, 1), (-2, -1))
     normal, target = gram[..., 1:, 1:], gram[..., 1:, 0]
     size = np.sqrt(np.einsum("...ii->...i", normal))
-    absent = size == 0.0  # no pump, no column of it: its coefficient is 0
+    absent = size == 0.0  # without pumping the coefficient of the pump is 0
     size = np.where(absent, 1.0, size)
     unit = normal / (size[..., :, None] * size[..., None, :]) + absent[..., None] * np.eye(3)
     values, vectors = np.linalg.eigh(unit)
@@ -234,14 +234,14 @@ def _solve(batch: _Batch, cells: NoiseModel) -> _Solved:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well the model with disturbances describes its rows; a good fit has variance 1 and correlation 0.
+    """Quality of the fit; a good fit has innovations of variance 1 and correlation 0.
 
     variance, autocorrelation: of the one-step innovations in units of their own predicted sd, at the mean noise model.
     late_share: of a dose, not seen by the next reading. dose_spread: sd of a dose over its mean size. growth_spread: sd
     of the mean growth over an hour, over mu. noise: sd of a reading relative to its OD at the mean OD; it is
     hypot(noise_floor, noise_relative * OD) in OD, with the correlation noise_lag1 from row to row. feedback:
-    correlation of an innovation with the change of the pump rate made on it; answers: it is beyond chance, 2/sqrt(n).
-    effective: points of the noise model that carry the average. hills: 95 % of 1/tau's between points over that within.
+    correlation of an innovation with the change of the pump rate made on it; answers: whether it exceeds chance,
+    2/sqrt(n). effective: effective points of the average. hills: 95 % of 1/tau's between points over that within.
     """
 
     variance: float
@@ -261,10 +261,10 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """mu (mean over the rows) and tau of one series, None where the rows do not show it; both with 95 % intervals.
+    """Estimate of mu (mean over the rows) and tau of one series with 95 % intervals; None if not identifiable.
 
-    condition: of the normal equations, scaled. expected: OD that the readings before each row and the pump predict, nan
-    without a reading (n,). innovation: of each reading in units of its predicted sd, (n,).
+    condition: of the normal equations, scaled. expected: OD predicted from earlier readings and the pump, nan without a
+    reading (n,). innovation: of each reading in units of its predicted sd, (n,).
     """
 
     mu: Parameter
@@ -277,15 +277,15 @@ class Estimate:
 
 
 def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0) -> list[Estimate]:
-    """Fit each of M series alone; all of them in one pass.
+    """Fit each of M series separately, in one pass.
 
     Intervals are quantiles of the mixture of the points' Student t distributions. mu is the mean of the growth rate
-    over the rows, mu + S_end/L with S the integral of w and L the rows' duration: that is what the rows can tell when
-    growth wanders as slowly as the recording is long.
+    over the rows, mu + S_end/L with S the integral of w and L the rows' duration: which the rows identify even if
+    growth fluctuates as slowly as the recording is long.
 
     Args: parts: screened series; readings may be nan, time and pump count throughout. rounds: points of the noise
-      model; QUICK where many short parts are estimated and an interval decides nothing alone. seed: of the points.
-    Returns: one `Estimate` each, which need not be worth anything: see `refusal.check_estimate`.
+      model; QUICK for many short parts whose single intervals decide nothing. seed: of the points.
+    Returns: one `Estimate` each; check it by `refusal.check_estimate`.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)
@@ -342,7 +342,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
 
 
 def _averaged(batch: _Batch, rounds: tuple[int, ...], seed: int) -> tuple[NoiseModel, _Solved, Array, NoiseModel]:
-    """Points of the noise model, what they give, their weights (M, G), and the mean point of each series."""
+    """Return points of the noise model, their solutions, weights (M, G), and the mean point of each series."""
     solved: list[_Solved] = []
 
     def score(z: Array) -> Array:
@@ -366,7 +366,7 @@ def _mean_growth(batch: _Batch, solved: _Solved, sigma: Array) -> tuple[Array, A
 
 
 def _quantiles(centre: Array, sd: Array, weight: Array, degrees: float) -> Parameter:
-    """Median and central 95 % of a mixture of Student t distributions, each cut into STRATA of equal probability."""
+    """Return median and central 95 % of a mixture of Student t distributions, in STRATA of equal probability each."""
     from scipy.special import stdtrit
 
     places = stdtrit(degrees, (np.arange(STRATA) + 0.5) / STRATA)
@@ -375,7 +375,7 @@ def _quantiles(centre: Array, sd: Array, weight: Array, degrees: float) -> Param
 
 
 def _weighted(values: Array, weight: Array) -> Parameter:
-    """Median and central 95 % of weighted values, shape (n,) each."""
+    """Return median and central 95 % of weighted values, shape (n,) each."""
     order = np.argsort(values)
     below = np.cumsum(weight[order])
     below = (below - 0.5 * weight[order]) / below[-1]
@@ -384,7 +384,7 @@ def _weighted(values: Array, weight: Array) -> Parameter:
 
 
 def _feedback(part: Series, innovation: Array) -> float:
-    """Correlation of the innovations with the change of the pump rate decided on them; 0 where either is constant."""
+    """Correlate the innovations with the following change of the pump rate; 0 if either is constant."""
     seen = np.isfinite(innovation)
     z = innovation[seen] - innovation[seen].mean()
     change = np.diff(part.pump_rate, prepend=part.pump_rate[0])[seen]
@@ -414,9 +414,9 @@ def _traces(batch: _Batch, cells: NoiseModel) -> _Traces:
 def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
     """Find readings that all others contradict: deletion residual beyond 4.5 robust sd, the largest of five neighbours.
 
-    With e = ln y - X b and V its covariance, reading i differs from what all others say about it by (V^-1 e)_i sd's,
-    divided by the root of (V^-1)_ii; a disturbance smoother at the mean noise model gives both (de Jong 1989,
-    Biometrika 76:82). Three passes, since a large one hides a small one.
+    With e = ln y - X b and V its covariance, reading i differs from its prediction by all others by (V^-1 e)_i /
+    sqrt((V^-1)_ii) sd; a disturbance smoother at the mean noise model gives both (de Jong 1989, Biometrika 76:82).
+    Three passes, since a large outlier hides a small one.
 
     Returns: for each series True at its outliers, shape (n,).
     """
@@ -433,7 +433,7 @@ def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
 
 
 def _deletion_residuals(batch: _Batch, cells: NoiseModel, best: Array) -> Array:
-    """(V^-1 e)_i / sqrt((V^-1)_ii) for sigma = 1, nan without a reading, shape (M, n)."""
+    """Return (V^-1 e)_i / sqrt((V^-1)_ii) for sigma = 1, nan without a reading, shape (M, n)."""
     run = _Filter(batch, cells)
     steps = list(run.rows())
     m, n = batch.dt.shape
@@ -457,7 +457,7 @@ def _deletion_residuals(batch: _Batch, cells: NoiseModel, best: Array) -> Array:
 
 
 def _back(run: _Filter, i: int, pull: Array, weight: Array) -> tuple[Array, Array]:
-    """T' r and T' N T of row i, T the transition that `_Filter` makes after the row."""
+    """Return T' r and T' N T of row i, with T the transition of `_Filter` after the row."""
     m = pull.shape[1]
     transition = np.zeros((4, 4, m))
     dt, decay = run.batch.dt[:, i], run.decay(i)[:, 0]
@@ -468,7 +468,7 @@ def _back(run: _Filter, i: int, pull: Array, weight: Array) -> tuple[Array, Arra
 
 
 def _peaks(residual: Array) -> Mask:
-    """Beyond 4.5 robust sd and the largest within two rows on each side, shape (n,)."""
+    """Find values beyond 4.5 robust sd that are the largest within two rows on each side, shape (n,)."""
     size = np.where(np.isfinite(residual), np.abs(residual), 0.0)
     known = size[np.isfinite(residual)]
     limit = OUTLIER_SD * 1.4826 * float(np.median(known)) if len(known) else np.inf

@@ -1,4 +1,4 @@
-"""When an estimate of tau is not to be believed, and what its rows tell all the same."""
+"""Checks of an estimate of tau, and estimates without tau."""
 
 from dataclasses import dataclass
 
@@ -18,15 +18,15 @@ POSSIBLE_TAU = (0.01, 10.0)  # a pump of 1 mL/s at 0.6 to 600 mL
 WIDEST_TAU = 0.3  # half width of 1/tau over its value, of a pair that is returned
 STEEPEST_HILLS = 3.0  # spread of 1/tau between points of the noise model over that within one
 NARROW = 0.1  # half width of an interval over its value, below which hills do not matter
-SETTLED_ROWS = 2  # after a dose, which the readings may show late
+SETTLED_ROWS = 2  # after a dose, which the readings may show with a delay
 
 
 def check_estimate(found: Estimate, series: Series) -> None:
-    """Refuse an estimate that is not to be believed.
+    """Refuse an unreliable estimate.
 
-    A law that answers each reading in proportion (u = u0 + c (x - r)) hides the dose's effect behind the correlation of
-    readings: mu comes out many times too high, with an interval that looks fine. What tells it is a wide tau, a 1/tau
-    that may be zero, an impossible mu, or a 1/tau that each noise model of those likely puts elsewhere.
+    With a proportional controller (u = u0 + c (x - r)) the correlation of readings hides the dose's effect: mu is many
+    times too high, with a narrow interval. Signs are a wide tau, a 1/tau that may be zero, an impossible mu, or a 1/tau
+    that differs between likely noise models.
 
     Raises: NotIdentifiable.
     """
@@ -67,10 +67,10 @@ def check_estimate(found: Estimate, series: Series) -> None:
 
 @dataclass(frozen=True)
 class GrowthAlone:
-    """What rows tell that cannot tell tau, 1/min; rows are [first, end).
+    """Estimates of rows that do not identify tau, 1/min; rows are [first, end).
 
-    net: by which ln x really grew over the longest trustworthy stretch. mu: of the longest stretch in which the pump
-    rested, None where that is too short.
+    net: increase of ln x over the longest trustworthy stretch. mu: of the longest stretch without pumping, None if that
+    is too short.
     """
 
     net: Parameter
@@ -97,7 +97,7 @@ def _rows(rows: tuple[int, int]) -> str:
 
 
 def growth_alone(raw: Series) -> GrowthAlone | None:
-    """Fit mu and the net growth of a recording that cannot tell tau; None without the readings for either.
+    """Fit mu and the net growth of a recording that does not identify tau; None without enough readings.
 
     Raises: ValueError when no trustworthy readings are left.
     """
@@ -118,7 +118,7 @@ def growth_alone(raw: Series) -> GrowthAlone | None:
 
 
 def _mean_slope(series: Series) -> Parameter:
-    """(ln y_end - ln y_start) per minute, the ends medians of five readings whose errors are those of the noise."""
+    """Return (ln y_end - ln y_start) per minute, from medians of five readings at each end."""
     seen = np.flatnonzero(series.od > OD_FLOOR)
     ends = seen[:START_READINGS], seen[-START_READINGS:]
     (first, last), (began, ended) = (

@@ -1,8 +1,8 @@
 """Which readings of a recording can be trusted: outliers, frozen or broken sensors, gaps. NumPy only, no model fitted.
 
-Judgement rests on the detrended log OD r = ln y - mu t + C/tau, C the pumped volume (the integral of u), with a robust
-pilot estimate of mu and 1/tau from short differences: whatever culture and pump do, r moves slowly, so that a jump in
-r is the sensor's (or a hand's) doing.
+The criterion is the detrended log OD r = ln y - mu t + C/tau, C the pumped volume (the integral of u), with a robust
+pilot estimate of mu and 1/tau from short differences: r moves slowly in every culture, so a jump in r comes from the
+sensor or a hand.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ __all__ = [
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-OD_FLOOR = 1e-3  # below it a logarithm says nothing
+OD_FLOOR = 1e-3  # below it a logarithm is meaningless
 OUTLIER_SD = 6.0
-OUTLIER_SHARE = 0.05  # a deviation below 5 % of the OD cannot move a fit and is left to the robust loss
+OUTLIER_SHARE = 0.05  # a deviation below 5 % of the OD is left to the robust loss
 OUTLIER_WINDOW = 11  # rows; finds bursts of up to five bad readings (bubbles: docs/biology.md, Sensor)
 NOISE_WINDOW = 61
 JUMP_LOG = 0.35  # a factor of 1.4 between the medians of five readings before and after
-JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps carry no weight in a least-squares fit of OD
+JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps hardly affect a fit
 JUMP_ROWS = 5
-SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
+SHORT_ROWS = 10  # between two jumps; a shorter part is a burst, not a regime
 FROZEN_ROWS = 10
-FEWEST_READINGS = 10  # that anything is estimated from
+FEWEST_READINGS = 10  # least number of readings for an estimate
 NOISY_FACTOR = 6.0
 WEEK_MIN = 10080
 LATE_MIN = 0.3  # of a merged minute, before its last reading
-GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
+GAP_MIN = 5.0  # and five times the usual spacing: the pump's action in between is unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A recording as the fit wants it.
+    """A recording for the fit.
 
     time: min, strictly increasing, shape (n,). od: OD, nan where there is no reading, shape (n,).
     pump_rate: mL/s, >= 0, held from each row to the next, shape (n,).
     row: number by which rows are reported, increasing, shape (n,).
-    Raises: ValueError when shapes or values disagree with that.
+    Raises: ValueError for other shapes or values.
     """
 
     time: Array
@@ -65,7 +65,7 @@ class Series:
             raise ValueError("series: pump rates must be >= 0 mL/s")
 
     def part(self, first: int, end: int) -> Series:
-        """Positions [first, end), as a series."""
+        """Return positions [first, end) as a series."""
         s = slice(first, end)
         return Series(self.time[s], self.od[s], self.pump_rate[s], self.row[s])
 
@@ -76,7 +76,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """Readings taken out for one reason; rows are row numbers."""
+    """Readings rejected for one reason; rows are row numbers."""
 
     reason: str
     rows: NDArray[np.int64]
@@ -84,7 +84,7 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A series without its faulty readings, its trustworthy stretches, and what was rejected.
+    """A series without its faulty readings, its trustworthy stretches, and the rejections.
 
     stretches: positions [first, end) between jumps and gaps that may be fitted, in order.
     """
@@ -102,7 +102,7 @@ def pumped_volume(time: Array, pump_rate: Array) -> Array:
 
 
 def runs(mask: Mask) -> list[tuple[int, int]]:
-    """Positions [first, end) of the stretches in which a mask, shape (n,), is True."""
+    """Return positions [first, end) of the stretches in which a mask, shape (n,), is True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -110,8 +110,8 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
 def merged(series: Series, longest: int = WEEK_MIN) -> Series:
     """Merge rows of half a minute and less, where there are more of them than `longest`: than a week has minutes.
 
-    A merged row stands at its last reading, with the median of the readings of the 18 s up to there, so that no dose
-    between two readings changes sides; the pump's volume is kept.
+    A merged row has the time of its last reading and the median of the readings of the 18 s before it, so a dose keeps
+    its order with readings; the pumped volume is kept.
     """
     if len(series.time) <= longest:
         return series
@@ -133,7 +133,7 @@ def merged(series: Series, longest: int = WEEK_MIN) -> Series:
 
 
 def row_spans(rows: NDArray[np.int64]) -> str:
-    """Row numbers as text: '3, 7-9'."""
+    """Write row numbers as text: '3, 7-9'."""
     if not len(rows):
         return "none"
     parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
@@ -155,7 +155,7 @@ def _slow_log_od(series: Series) -> Array:
     rise, columns, level = rise[ok], columns[ok], np.maximum(level[ok], OD_FLOOR)
     weight = level.copy()  # sd of ln y is sd(y) / y
     pilot = np.zeros(2)
-    for _ in range(8):  # reweighted least squares: a few jumps must not bend the pilot
+    for _ in range(8):  # reweighted least squares: robust to a few jumps
         pilot = np.linalg.lstsq(columns * weight[:, None], rise * weight, rcond=1e-10)[0]
         error = (rise - columns @ pilot) * level
         scale = max(1.4826 * float(np.median(np.abs(error))), 1e-9)
@@ -176,23 +176,23 @@ def running_median(values: Array, width: int) -> Array:
 
 
 def _deviation(series: Series, slow: Array) -> tuple[Array, Array]:
-    """Deviation of each reading from its neighbourhood, and the OD expected there; both OD, shape (n,)."""
+    """Return the deviation of each reading from its neighbourhood, and its expected OD; both OD, shape (n,)."""
     trend = np.log(np.maximum(series.od, OD_FLOOR)) - slow
     expected = np.exp(running_median(slow, OUTLIER_WINDOW) + trend)
     return series.od - expected, expected
 
 
 def noise_sd(series: Series) -> float:
-    """Robust sd of a reading about its neighbourhood (11 rows), OD; what no model of the culture can explain."""
+    """Return the robust sd of a reading about its neighbourhood (11 rows), OD: the noise of the sensor."""
     deviation, _ = _deviation(series, _slow_log_od(series))
     return float(1.4826 * np.nanmedian(np.abs(deviation)))
 
 
 def screen(series: Series) -> Screened:
-    """Find frozen, outlying and noisy readings, gaps, and jumps that no culture can make.
+    """Find frozen, outlying and noisy readings, gaps, and impossible jumps.
 
-    A jump parts the recording into regimes; the one with most readings is kept, the others are rejected whole, and so
-    is the last reading before a jump upwards, since one reading averages over several seconds. A gap only parts it.
+    Jumps split the recording into regimes. The one with most readings is kept; the others are rejected, also the last
+    reading before an upward jump, since a reading averages over several seconds. A gap only splits the recording.
 
     Returns: see `Screened`. Raises: ValueError if fewer than ten readings are left.
     """
@@ -201,7 +201,7 @@ def screen(series: Series) -> Screened:
     label = np.full(len(series.od), -1)
 
     def reject(bad: Mask, reason: str) -> Series:
-        label[bad & readings] = len(reasons)  # the latest judgement is the widest and stands
+        label[bad & readings] = len(reasons)  # the latest rejection is the widest and counts
         reasons.append(reason)
         return series.rejecting(label >= 0)
 
@@ -250,7 +250,7 @@ def _frozen(od: Array) -> Mask:
 
 
 def _gaps(time: Array) -> list[int]:
-    """Positions before which the recording pauses."""
+    """Return the positions before which the recording pauses."""
     step = np.diff(time)
     if not len(step):
         return []
@@ -258,7 +258,7 @@ def _gaps(time: Array) -> list[int]:
 
 
 def _jumps(series: Series, slow: Array) -> list[int]:
-    """Positions of the first reading after a persistent jump."""
+    """Return the positions of the first reading after a persistent jump."""
     valid = np.flatnonzero(np.isfinite(series.od))
     if len(valid) < 2 * JUMP_ROWS:
         return []
@@ -267,7 +267,7 @@ def _jumps(series: Series, slow: Array) -> list[int]:
     median_y = np.median(sliding_window_view(y, JUMP_ROWS), axis=1)
     step = median_r[JUMP_ROWS:] - median_r[:-JUMP_ROWS]
     level = np.minimum(median_y[JUMP_ROWS:], median_y[:-JUMP_ROWS])
-    size = np.maximum(level, OD_FLOOR) * np.expm1(np.abs(step))  # the jump in OD, free of growth and dilution
+    size = np.maximum(level, OD_FLOOR) * np.expm1(np.abs(step))  # the jump in OD, without growth and dilution
     smallest = max(JUMP_SHARE * float(np.percentile(y, 95)), OUTLIER_SD * noise_sd(series))
     big = (np.abs(step) > JUMP_LOG) & (size > smallest)
     found = []
@@ -279,7 +279,7 @@ def _jumps(series: Series, slow: Array) -> list[int]:
 
 
 def _foreign_regimes(series: Series, slow: Array, jumps: list[int]) -> Iterator[tuple[int, int, str]]:
-    """(first, end, reason) of every regime but the one with most readings; short bursts are bridged."""
+    """Return (first, end, reason) of every regime but the one with most readings; short bursts are bridged."""
     regimes = [[(a, b)] for a, b in zip([0, *jumps], [*jumps, len(series.od)], strict=True)]
     readings = [int(np.isfinite(series.od[r[0][0] : r[0][1]]).sum()) for r in regimes]
     bursts: list[tuple[int, int]] = []

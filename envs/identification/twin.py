@@ -1,12 +1,12 @@
-"""The plant a recording came from: mu(t) and tau(t) as they drifted, noise of the sensor, spread of doses, outliers.
+"""The plant behind a recording: mu(t) and tau(t), noise of the sensor, spread of doses, outliers.
 
-k(t) = 1/tau(t) is a smooth curve through the estimates of the segments, which hold whatever moved the pump. With k(t),
-what is left of the readings is growth alone,
+k(t) = 1/tau(t) is a smooth curve through the estimates of the segments, which are valid for every pump control. With
+k(t), the remaining change of the readings is growth,
 
     g_i = ln y_i + sum over j < i of k(t_j) c_j = b + integral of mu + s_i + v_i,     c_j = u_j dt_j
 
-where doses that spread make s a random walk and v is the noise of the readings, both as the window's estimate has them.
-mu(t) is a smooth curve as k(t) is: a line plus a random walk, as large as the recording makes likely.
+where the spread of doses makes s a random walk and v is the noise of the readings, both from the window's estimate.
+mu(t) is a smooth curve like k(t): a line plus a random walk, whose size is estimated.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ __all__ = ["Course", "Noise", "Twin", "twin"]
 
 Array = NDArray[np.float64]
 
-FEWEST_SEGMENTS = 4  # with a tau of their own; of fewer no drift can be told, and tau is the returned one throughout
+FEWEST_SEGMENTS = 4  # segments with a tau; with fewer tau is the returned one throughout
 WANDER = np.concatenate([[0.0], np.geomspace(0.005, 0.3, 12)])  # of a curve about its line: sd after 1 h over its mean
-FLAT = 25.0  # variance of levels, and of a line's two coefficients over the mean: far beyond what a recording leaves
+FLAT = 25.0  # prior variance of levels, and of a line's two coefficients over the mean: very wide
 BLOCKS = 400  # of rows at most, whose means are compared with mu(t)
-EXACT = 1e-8  # variance of ln y that is left to a reading without noise: 0.01 % of the OD
+EXACT = 1e-8  # least variance of ln y of a reading: 0.01 % of the OD
 OUTLIER_OD = 0.04  # least deviation of an outlier (docs/biology.md, Sensor)
 
 
@@ -42,10 +42,10 @@ class Course:
 
 @dataclass(frozen=True)
 class Noise:
-    """What lies between a plant without noise and the readings.
+    """Noise between a noise-free plant and the readings.
 
     The sd of a reading is hypot(floor, relative * OD), its correlation from row to row lag1. dose_cv: sd of a dose over
-    its mean. outlier_rate: share of readings off by more than 0.04 OD.
+    its mean. outlier_rate: fraction of readings off by more than 0.04 OD.
     """
 
     floor: float
@@ -59,7 +59,7 @@ class Noise:
 class Twin:
     """A recording as a plant; knot_min counts from its first trustworthy row, shape (J,); rows are [first, end).
 
-    start_od: OD at the first row. row_min: median time between rows. drifts: whether tau was free to.
+    start_od: OD at the first row. row_min: median time between rows. drifts: whether tau may drift.
     """
 
     knot_min: Array
@@ -75,7 +75,7 @@ class Twin:
 def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
     """Fit the plant behind all trustworthy rows of a calibrated recording, a knot about every `knot_every_min` min.
 
-    Of a recording of more than a week it is that of the window.
+    For a recording of more than a week it covers the window.
 
     Args: raw: the recording before screening, at the same positions as `result`'s.
     """
@@ -142,17 +142,17 @@ class _Rows:
         return np.asarray(np.interp(np.arange(len(self.seen)), at, (self.log_od + self.pumped @ k)[at]))
 
     def doses(self, k: Array) -> Array:
-        """By how much each row's dose lowers ln y, shape (n,)."""
+        """Return the decrease of ln y by each row's dose, shape (n,)."""
         return np.asarray(self.part.pump_rate * self.step * (self.hats @ k))
 
 
 def _summed(steps: Array) -> Array:
-    """Sum what all earlier rows add, shape (n, J)."""
+    """Sum the contributions of all earlier rows, shape (n, J)."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps[:-1], axis=0)])
 
 
 def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """Fit a line plus a random walk at P points to n linear observations, averaged over the walk's likely sizes.
+    """Fit a line plus a random walk at P points to n linear observations, averaged over the size of the walk.
 
     Args: at_h: hours, (P,). mean: scale of the curve. seen: observations, (n,). towards: their weights on the points,
       (n, P). noise: covariance of their errors, (n, n).
@@ -180,7 +180,7 @@ def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) 
 def _inverse_tau(result: Calibration, at: Array) -> tuple[Array, Array, bool]:
     """Estimate k at times in min, shape (J,), its covariance (J, J), and whether its drift is identifiable.
 
-    Before the first and after the last segment with a tau of its own k stays.
+    Before the first and after the last segment with a tau, k is constant.
     """
     known = [(s.middle_min, s.tau) for s in result.segments if s.tau is not None]
     if len(known) < FEWEST_SEGMENTS:
@@ -196,7 +196,7 @@ def _inverse_tau(result: Calibration, at: Array) -> tuple[Array, Array, bool]:
 
 
 def _inverse(tau: Parameter) -> tuple[float, float]:
-    """1/tau and its sd."""
+    """Return 1/tau and its sd."""
     return 1.0 / tau.value, (1.0 / tau.low - 1.0 / tau.high) / 3.92
 
 
@@ -217,7 +217,7 @@ def _growth(rows: _Rows, k: Array, k_cov: Array, noise: Noise, mean: float) -> t
 
 
 def _outliers(rows: _Rows, k: Array, raw: Series) -> float:
-    """Share of readings that the screening rejected and that are far from what those around them say."""
+    """Return the fraction of rejected readings that are far from their neighbours."""
     rejected = np.isfinite(raw.od) & ~np.isfinite(rows.part.od)
     far = np.abs(raw.od - np.exp(rows.grown(k) - rows.pumped @ k)) >= OUTLIER_OD
     return float((rejected & far).sum() / np.isfinite(raw.od).sum())

@@ -1,4 +1,4 @@
-"""How a pair (mu, tau) predicts readings that it was not fitted to, an hour or so ahead each."""
+"""Predictions by a pair (mu, tau) of readings outside its fit, about an hour ahead each."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ __all__ = ["Ahead", "Validation", "attainable_pct", "validate"]
 
 Array = NDArray[np.float64]
 
-START_READINGS = 5  # that set the start of a prediction and are not scored
+START_READINGS = 5  # readings that set the start of a prediction and are not scored
 
 
 AHEAD_MIN = (30.0, 60.0)
@@ -40,7 +40,7 @@ class Ahead:
 
 @dataclass(frozen=True)
 class Validation:
-    """PMSE of predictions, each from a fresh start every horizon, %; None where there are no such readings.
+    """PMSE of predictions, each from a fresh start every horizon, %; None without such readings.
 
     holdout_pct: the pair of the window's first 70 % on its last 30 %. early_pct: the same pair on its own rows.
     outside_pct: the returned pair on the trustworthy rows outside the window. ahead: the first half of all trustworthy
@@ -56,7 +56,7 @@ class Validation:
 
 
 def validate(screened: Screened, window: tuple[int, int], pair: tuple[float, float], horizon_min: float) -> Validation:
-    """Score a pair (mu in 1/min, tau), and the one that the window's first part gives."""
+    """Score a pair (mu in 1/min, tau), and the pair of the window's first part."""
     clean, (a, b) = screened.series, window
     cut = a + int(0.7 * (b - a))
     before = clean.part(a, cut)
@@ -101,7 +101,7 @@ def _ahead(screened: Screened) -> Iterator[Ahead]:
 
 
 def attainable_pct(found: Estimate, part: Series, horizon_min: float) -> float:
-    """PMSE over a horizon that the disturbances of an estimate make by themselves, %.
+    """Return the PMSE over a horizon caused by the disturbances of an estimate, %.
 
     Doses off by e_i leave the sum of k c_i e_i in ln x, growth off by w over the horizon H leaves w t:
     100 (half the variance of all doses in H + (mu w H)^2 / 3).
@@ -115,19 +115,19 @@ def attainable_pct(found: Estimate, part: Series, horizon_min: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Readings and what was predicted for them, shape (n,)."""
+    """Readings and their predictions, shape (n,)."""
 
     od: Array
     predicted: Array
 
     @property
     def pmse_pct(self) -> float | None:
-        """None where nothing was scored."""
+        """PMSE in %; None without scored readings."""
         return pmse(self.od, self.predicted) if len(self.od) else None
 
 
 def _predictions(clean: Series, places: list[tuple[int, int]], pair: tuple[float, float], horizon: float) -> _Scored:
-    """Free runs over the places, each horizon from a start of its own that its first five readings set."""
+    """Run the model freely over the places, each horizon from a start set by its first five readings."""
     od, predicted = [np.empty(0)], [np.empty(0)]
     for part in (clean.part(*cut) for place in places for cut in cuts(clean, *place, horizon)):
         used = np.flatnonzero(np.isfinite(part.od))[START_READINGS:]

@@ -1,4 +1,4 @@
-"""What to do with a pair, in one line: use it, or use it with care. Without a pair: `refusal`."""
+"""Verdict on a pair, in one line: use it, or use it with care. Without a pair: `refusal`."""
 
 from collections.abc import Iterator
 
@@ -14,9 +14,9 @@ __all__ = ["judged"]
 
 PLAUSIBLE_TAU = (0.05, 2.0)
 UNEVEN = 0.25  # sd of a dose over its size
-SLOW_ROWS_MIN = 2.0  # a pump that changes between rows misleads the estimate
+SLOW_ROWS_MIN = 2.0  # a pump rate that changes between rows biases the estimate
 UNSTEADY = 0.15  # sd of the mean growth over an hour, over mu
-UNSEEN = 0.5  # share of a dose that the next reading does not see
+UNSEEN = 0.5  # fraction of a dose missing from the next reading
 CORRELATED = 0.2  # of innovations from row to row
 AGAIN = "calibrate again shortly before the run, or fly the policy that ships (policy=shipped), which needs no pair"
 
@@ -24,9 +24,9 @@ AGAIN = "calibrate again shortly before the run, or fly the policy that ships (p
 def judged(
     result: Calibration, limit: float, doubts: tuple[tuple[str, str], ...] = ()
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Judge a fit: the verdict, and all that speaks against the fit, the gravest first.
+    """Judge a fit: the verdict, and all reasons against the fit, the most serious first.
 
-    Args: limit: of predictions, PMSE in %. doubts: about the recording, each with what to do.
+    Args: limit: of predictions, PMSE in %. doubts: about the recording, each with a remedy.
     """
     against = [*doubts, *_against(result, limit)]
     mu, tau = (100.0 * p.half_width / p.value for p in (result.mu, result.tau))
@@ -39,7 +39,7 @@ def judged(
 
 
 def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
-    """Yield pairs (what is wrong, what to do about it)."""
+    """Yield pairs (problem, remedy)."""
     mu, tau = result.mu, result.tau
     for name, value, (low, high) in (("mu", mu.value, PLAUSIBLE_MU), ("tau", tau.value, PLAUSIBLE_TAU)):
         if not low <= value <= high:
@@ -88,9 +88,9 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
 
 
 def _about_bench_and_culture(q: Quality) -> Iterator[tuple[str, str]]:
-    """By the lower end of each interval."""
+    """Yield problems of bench and culture, by the lower end of each interval."""
     if q.growth_spread.low > UNSTEADY:
-        yield f"growth wanders by {100.0 * q.growth_spread.low:.0f} % at least from hour to hour", AGAIN
+        yield f"growth rate fluctuates by {100.0 * q.growth_spread.low:.0f} % at least from hour to hour", AGAIN
     if q.dose_spread.low > UNEVEN:
         said = f"doses spread by {100.0 * q.dose_spread.low:.0f} % at least"
         yield said, "look at the feed's tube and needle, and measure the pump (python -m experiments.calibrate_pump)"

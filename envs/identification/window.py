@@ -1,4 +1,4 @@
-"""The stretch of a recording that one pair (mu, tau) may describe."""
+"""The window: the stretch of a recording for one pair (mu, tau)."""
 
 import numpy as np
 
@@ -14,11 +14,11 @@ SHORTEST_WINDOW_MIN = 60.0
 
 
 def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: float) -> tuple[Window, str]:
-    """Positions [first, end) of the window with most readings, and the reason in words.
+    """Return positions [first, end) of the window with most readings, and the reason as text.
 
-    Consecutive segments of one stretch whose estimates do not drift, of a week at most. Windows with a segment that
-    tells tau, and without one in which dilution stopped to act (`_failed`), come before all others.
-    Raises: NotIdentifiable when there is none of an hour at least.
+    A window is consecutive segments of one stretch without drift, of at most a week. Windows with a segment that
+    identifies tau, and without a segment in which dilution had no effect (`_failed`), are preferred. Raises:
+    NotIdentifiable without a window of at least an hour.
     """
     clean = screened.series
     failed = _failed(clean, along)
@@ -57,9 +57,9 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
 
 
 def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
-    """Find segments that pumped as much as half of all and tell no tau, where most that pumped so much do tell it.
+    """Find segments of at least median pump rate that identify no tau although most of them do.
 
-    So does a feed that fails, or a culture that collapses: their pump rate is recorded and dilutes nothing.
+    Causes are a failed feed or a collapsed culture: the recorded pump rate does not dilute.
     """
     pumped = [float(clean.pump_rate[s.first : s.end].mean()) for s in along]
     busy = [s for s, rate in zip(along, pumped, strict=True) if rate >= np.median(pumped) and rate > 0.0]

@@ -1,4 +1,4 @@
-"""Where a plant's randomness comes from: one stream per vial, drawn whatever a controller does."""
+"""Random numbers of a plant: one stream per vial, independent of the controller."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ Streams = Sequence[np.random.Generator]
 
 
 def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Generator]:
-    """One generator per vial, shape n; stream i of a spawned set is the same whatever n is.
+    """Return one generator per vial, n; stream i of a spawned set is the same for every n.
 
     Raises: ValueError if a sequence of another length than n is given.
     """
@@ -30,16 +30,15 @@ def spread(rngs: Streams, mean: Array | float, cv: Array | float) -> Array:
 
 
 def uniform(rngs: Streams, low: float, high: float) -> Array:
-    """Uniform on [low, high), one draw per stream, shape (N,)."""
+    """Draw uniformly on [low, high), one number per stream, shape (N,)."""
     return np.asarray([low + (high - low) * rng.random() for rng in rngs], dtype=np.float64)
 
 
 class Tape:
-    """Rows of ready random numbers, one row per event, the same event for all vials at once.
+    """Rows of random numbers, one row per event of all vials.
 
-    Every row has the same number of draws whether or not they are used, so what a controller does never shifts what
-    is drawn later: two controllers with equal seeds meet equal noise (paired comparison), and vial i meets the noise
-    of stream i whatever N is.
+    Every row has the same number of draws, used or not, so a controller cannot change later draws. Two controllers with
+    equal seeds meet equal noise (paired comparison), and vial i meets the noise of stream i for every N.
 
     Args:
       rngs: one stream per vial.

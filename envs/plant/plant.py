@@ -1,7 +1,7 @@
-"""The plant: N vials with pumps, heater, wall and sensor, for testing what was trained on the simple model.
+"""The plant: N vials with pumps, heater, wall and sensor, to test policies of the simple model.
 
-It is not the training model. It shares the growth-law interface with it and nothing else, and reproduces it only when
-everything real is switched off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
+It is independent of the training model except for the growth-law interface. It equals that model only with all real
+effects off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else."""
+    """Settings of a plant; the defaults are the preset `nominal`, the training model."""
 
     growth: GrowthConfig = part(GrowthConfig, "growth of the culture")
     pump: PumpConfig = part(PumpConfig, "flow of the pumps")
@@ -100,19 +100,19 @@ class Plant:
     """N vials, advanced together: parts `culture`, `vessel`, `thermal`, `feed` (the pump), `sensor`, `fluorescence`.
 
     With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and the dilution
-    rate is 0 after it; F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays
-    in the vial. Source of the terms and numbers: docs/biology.md.
+    rate is 0 after it; F = exp(-v/V) for a volume v exchanged at constant volume, V/(V + v) for a volume that stays in
+    the vial. Source of the terms and numbers: docs/biology.md.
 
-    What is drawn once (growth rate, pump flow, optics, tube height) is drawn here, recorded in `draws`, and stays over
-    `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and sensor
-    noise per reading, from one stream per vial. Neither depends on the pump commands, and vial i is the same
-    whatever N is.
+    Constants of a reactor (growth rate, pump flow, optics, tube height) are drawn here, recorded in `draws`, and
+    survive `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and
+    sensor noise per reading, from one stream per vial. Neither depends on the pump commands, and vial i is the same for
+    every N.
 
     Args:
-      config: what is real about it.
+      config: its settings.
       n: number of vials.
       rng: a generator, from which one stream per vial is spawned, or a sequence of n generators.
-      volume_ml: what the bench says of each culture, mL, (N,) or one for all; the config may differ from it.
+      volume_ml: volume of the bench, mL, (N,) or one for all; the config may override it.
     Raises: ValueError for n < 1 or a sequence of another length.
 
     State and fault switches are arrays of shape (N,) in the parts. A switch may be set at any time and stays until it
@@ -131,7 +131,7 @@ class Plant:
         self.config, self.n = config, n
         parts = [r.spawn(7) for r in streams(rng, n)]
         once, process, reading, start, second, light, thermometer = ([p[k] for p in parts] for k in range(7))
-        # The parts draw from the same streams: their order belongs to what a seed means.
+        # The parts draw from the same streams: their order affects the draws of a seed.
         integrate = INTEGRATORS[config.integrator]
         mu, draws = spread(once, config.growth.mu, config.growth.mu_cv), dict[str, Array]()
         own = response(config.growth.temperature_law, config, config.growth.activation_kj_mol, 0)
@@ -161,13 +161,13 @@ class Plant:
         temperature: Array | float | None = None,
         share: Array | float | None = None,
     ) -> None:
-        """Start a new culture at the waste tube's level, in balance with the medium it grew from.
+        """Start a new culture at the waste tube's level, in balance with its medium.
 
         Args:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
           temperature: of vial and thermostat, degC, as `od`; None = `start_temperature` of the config.
           share: of the second strain, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
-        Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below
+        Fault switches, bottle content and drawn parameters stay. Raises: ValueError for an OD below
         0 or a share outside 0 to 1.
         """
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)
@@ -200,12 +200,12 @@ class Plant:
 
         Args:
           minutes: length of the interval, min, > 0.
-          feed_s: on-time of the feed pump at full power, s, shape (N,) or scalar. Negative runs it backwards: culture
-            is drawn out. An on-time that fills the interval leaves the pulse open for the next call.
-          waste_s: on-time of the waste pump, s, same shape, beside the feed; None = as much as is needed.
-            Negative blows air and changes nothing.
-          temperature_target: thermostat, degC, scalar or shape (N,); None or nan leaves it, 0 is off.
-          overflow_s: on-time of the overflow pump, s, as `waste_s`; 0 = there is none.
+          feed_s: on-time of the feed pump at full power, s, shape (N,) or scalar. Negative: the pump runs backwards and
+          removes culture. An on-time of the whole interval continues the pulse into the next call.
+          waste_s: on-time of the waste pump, s, same shape, beside the feed; None: as much as needed. Negative blows
+          air without effect.
+          temperature_target: thermostat, degC, scalar or shape (N,); None or nan: unchanged, 0: off.
+          overflow_s: on-time of the overflow pump, s, as `waste_s`; 0: none.
           supply_ml: another fluid without cells by a spare pump, mL, shape (N,) or scalar, with the feed.
         Raises: ValueError for an interval not positive or an on-time not finite.
         """
@@ -230,7 +230,7 @@ class Plant:
     def _advance_piece(
         self, minutes: float, feed_s: Array, waste_s: Array, overflow_s: Array, supply_ml: Array
     ) -> None:
-        """At most one minute: this minute's draws, doses, heat, growth, evaporation."""
+        """Advance at most one minute: draws, doses, heat, growth, evaporation."""
         self._draw_minutes()
         volume = self.vessel.volume_ml
         fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.age_min) + supply_ml
@@ -254,7 +254,7 @@ class Plant:
         self.minutes += minutes
 
     def _draw_minutes(self) -> None:
-        """Take the draws of every minute begun since the last call."""
+        """Take the draws of every minute since the last call."""
         while self._minute < int(np.floor(self.minutes + 1e-6)):
             (z_pump, z_mu, z_ripple), (u_timing, u_prime) = self._tape.next()
             self.feed.new_minute(z_pump, u_timing, u_prime)
@@ -267,7 +267,7 @@ class Plant:
             self._minute += 1
 
     def expected_od(self, minutes: float, feed_s: Array) -> Array:
-        """Suspended biomass after an interval without surprises, OD, (A, N); changes nothing.
+        """Return the expected suspended biomass after an interval, OD, (A, N); without side effects.
 
         Each strain grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is
         diluted by the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
@@ -285,9 +285,9 @@ class Plant:
         return np.asarray((self.culture.biomass * grown * (1.0 if continuous else np.exp(-dose))).sum(axis=-1))
 
     def at_rest(self, minutes: float, feed_s: Array | float) -> tuple[Array, Array]:
-        """Compute what one mean dose of `feed_s` s takes off ln x, and the share that growth makes up for, each (N,).
+        """Compute the decrease of ln x by one mean dose of `feed_s` s, and the growth share, each (N,).
 
-        Args: minutes: between two doses. As `expected_od`, of this moment.
+        Args: minutes: between two doses. Conditions as in `expected_od`.
         """
         rate, biomass = self.culture.rates(self.age_min), self.culture.biomass
         taken = self.feed.expected(np.broadcast_to(feed_s, (self.n,)), self.age_min) / self.vessel.volume_ml
@@ -300,12 +300,12 @@ class Plant:
         return self.draws["start_min"] + self.minutes
 
     def read_od(self) -> Array:
-        """One averaged reading of every sensor, with all that is configured or switched on, OD, shape (N,)."""
+        """Take one averaged reading of every sensor, with all errors and faults, OD, shape (N,)."""
         return self.sensor.read(self.culture.in_light_path, self.culture.wall, self.minutes)
 
     @property
     def apparent_od(self) -> Array:
-        """What a noise-free sensor would show now, OD, shape (N,)."""
+        """Return the reading of a noise-free sensor, OD, shape (N,)."""
         return self.sensor.apparent(self.culture.in_light_path, self.culture.wall, self.minutes)
 
     def read_fluorescence(self) -> Array:

@@ -1,4 +1,4 @@
-"""A peristaltic pump head: seconds at full power in, millilitres of fresh medium out."""
+"""A peristaltic pump head: from seconds at full power to millilitres of fresh medium."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ __all__ = ["FeedPump", "PumpConfig"]
 
 Array = NDArray[np.float64]
 
-PRIME_IDLE_MIN = 10.0  # rest after which the line must be primed
+PRIME_IDLE_MIN = 10.0  # pause after which the line must be primed
 
 
 @dataclass(frozen=True)
 class PumpConfig:
-    """How a pump turns on-time into volume; the defaults are a perfect pump of 1 mL/s.
+    """Flow of a pump; the defaults are a perfect pump of 1 mL/s.
 
-    `pulse` gives the whole dose at the start of the interval, as the device does; `continuous` spreads it evenly over
-    the interval, as the training model assumes. tau = 20 mL / (60 s * gain).
+    `pulse`: the whole dose at the start of the interval, as on the device; `continuous`: evenly over the interval, as
+    in the training model. tau = 20 mL / (60 s * gain).
     """
 
     dosing: str = setting("continuous", "when the dose of an interval flows", choices=("continuous", "pulse"))
@@ -76,13 +76,12 @@ class FeedPump:
     Dose of a pulse of t s:  max(0, g (1 + cv z) p max(0, t + e - t0) - leak), and 0 for t < min_pulse_s, with flow g,
     this minute's draw z, prime fraction p, timing error e and dead time t0 (docs/biology.md, Pumps).
 
-    A pulse may be asked for in pieces: while the pump does not pause between calls it is one pulse, with one dead
-    time, one timing error and one back-leak.
+    Calls without a pause between them form one pulse, with one dead time, one timing error and one back-leak.
 
     Args:
-      config: what is wrong with them; rngs: one stream per vial.
-    `gain_factor` and `back_leak_ml`, shape (N,), are fault switches; `media_left_ml` is what the bottle still
-    holds, `delivered_ml` the fresh medium delivered since reset.
+      config: their errors; rngs: one stream per vial.
+    `gain_factor` and `back_leak_ml`, shape (N,), are fault switches; `media_left_ml` is the volume left in the bottle,
+    `delivered_ml` the volume delivered since reset.
     """
 
     def __init__(self, config: PumpConfig, rngs: Streams) -> None:
@@ -95,7 +94,7 @@ class FeedPump:
         self.reset()
 
     def reset(self) -> None:
-        """Primed and at rest."""
+        """Reset the pumps to primed and at rest."""
         n = self.gain_factor.size
         self.delivered_ml: Array = np.zeros(n)
         self._idle_min = np.zeros(n)
@@ -105,26 +104,26 @@ class FeedPump:
         self._on_s, self._moved_ml, self._dosed_ml = np.zeros(n), np.zeros(n), np.zeros(n)
 
     def new_minute(self, z: Array, u_timing: Array, u_prime: Array) -> None:
-        """Take this minute's draws: standard normal z and two uniforms, shape (N,)."""
+        """Set the random draws of this minute: standard normal z and two uniforms, shape (N,)."""
         c = self.config
         self._noise = c.pulse_ar * self._noise + np.sqrt(1.0 - c.pulse_ar**2) * z
         self._timing = c.timing_error_s * u_timing
         self._prime = c.prime_low + (c.prime_high - c.prime_low) * u_prime
 
     def _effective(self, on_s: Array, longer_s: Array | float) -> Array:
-        """Seconds of a pulse of `on_s` s that move liquid if it lasts `longer_s` s longer than asked."""
+        """Return the seconds of a pulse of `on_s` s that move liquid if it lasts `longer_s` s longer."""
         c = self.config
         moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
         return np.where(moves, np.maximum(on_s + longer_s - c.dead_time_s, 0.0), 0.0)
 
     def _flow(self, age_min: Array) -> Array:
-        """Mean flow at full power of heads that are `age_min` min old, mL/s; both shape (N,)."""
+        """Return the mean flow at full power of heads of age `age_min` min, mL/s; both shape (N,)."""
         c = self.config
         drift = (1.0 + c.gain_drift_per_h * age_min / 60.0) * along(c.knots_min, c.knots_ml_s, c.gain_ml_s, age_min)
         return self.draws["pump_gain_ml_s"] * self.gain_factor * drift
 
     def expected(self, on_s: Array, age_min: Array) -> Array:
-        """Mean dose of one pulse of `on_s` s by a primed head, mL; on_s and the result end in (N,). Changes nothing.
+        """Return the mean dose of one pulse of `on_s` s by a primed head, mL; shapes end in (N,). No side effects.
 
         Args: as `deliver`.
         """
@@ -132,11 +131,11 @@ class FeedPump:
         return np.asarray(np.clip(self._flow(age_min) * moving - self.back_leak_ml, 0.0, self.media_left_ml))
 
     def deliver(self, on_s: Array, minutes: float, age_min: Array) -> Array:
-        """Run forward for `on_s` s at the start of an interval; volume of fresh medium delivered, mL, shape (N,).
+        """Run forward for `on_s` s at the start of an interval; return the volume delivered, mL, shape (N,).
 
         Args:
           on_s: seconds at full power, shape (N,), >= 0.
-          minutes: length of the interval, min; on_s that fills it leaves the pulse open.
+          minutes: length of the interval, min; an on_s of this length continues the pulse.
           age_min: of the head, min, for its drift, shape (N,).
         """
         pulsing = on_s > 0.0
@@ -158,5 +157,5 @@ class FeedPump:
         return np.asarray(dose)
 
     def drawn_back(self, on_s: Array) -> Array:
-        """Volume that running backward for `on_s` s, shape (N,), draws out of the vial, mL."""
+        """Return the volume that running backwards for `on_s` s, shape (N,), removes from the vial, mL."""
         return np.asarray(self.draws["pump_gain_ml_s"] * self.gain_factor * on_s)

@@ -19,13 +19,19 @@ FULL_SCALE = 65535.0  # counts of the 16-bit converter
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """What the averaged reading of one minute adds to the truth; the defaults are a perfect sensor."""
+    """Errors of the averaged reading of one minute; the defaults are a perfect sensor."""
 
     noise_floor: float = setting(
         0.0, "sd of a reading = hypot(noise_floor, noise_relative * OD)", "OD", within=(0, 0.1)
     )
     noise_relative: float = setting(0.0, "see noise_floor", within=(0, 0.1))
     noise_factor_sd: float = setting(0.0, "sd of the logarithm of a reactor's noise factor (median 1)", within=(0, 1))
+    noise_swing_sd: float = setting(
+        0.0, "sd of the logarithm of the slow factor (median 1) of a reactor's noise", within=(0, 1)
+    )
+    noise_swing_min: float = setting(
+        180.0, "correlation time of that factor, with a reading each minute", "min", within=(1, 10_000)
+    )
     lag1: float = setting(0.0, "correlation of the noise of successive readings", within=(0, 0.95))
     gain_cv: float = setting(0.0, "spread between reactors of the slope k in y = k (x + c x^2)", within=(0, 0.3))
     curvature: float = setting(0.0, "limit of c, which is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
@@ -49,13 +55,13 @@ class SensorConfig:
 
 
 def density(od: Array | float) -> Array:
-    """R of LINEAR R + QUADRATIC R^2 = OD; negative for a vial clearer than the blank, bounded where no root exists."""
+    """Return R of LINEAR R + QUADRATIC R^2 = OD; negative below the blank, limited if no root exists."""
     half = LINEAR / (2.0 * QUADRATIC)
     return np.asarray(np.sqrt(np.maximum(np.asarray(od) / QUADRATIC + half * half, 0.0)) - half)
 
 
 def counts_from_od(od: Array, blank: Array | float) -> Array:
-    """Raw count the device would show, its OD formula inverted; not rounded, >= 1 (docs/device.md, OD measurement).
+    """Return raw counts by the device's inverted OD formula; not rounded, >= 1 (docs/device.md, OD measurement).
 
     Args:
       od: device OD; blank: count of clear medium; broadcastable.
@@ -73,8 +79,8 @@ class OdSensor:
     """N sensors. y = k (x + c x^2) + wall_gain w + offset + drift t, then noise and misreadings.
 
     Args:
-      config: what is wrong with them.
-      rngs: one stream per vial for what is drawn once (slope, curvature, offset, noise factor, blank).
+      config: their errors.
+      rngs: one stream per vial for its constants (slope, curvature, offset, noise factor, blank).
       noise_rngs: one stream per vial for the readings; a reading draws one row, always of the same length.
     `frozen` (bool) and `extra_offset` (OD), shape (N,), are fault switches that may be set at any time.
     """
@@ -88,21 +94,22 @@ class OdSensor:
             "sensor_offset": uniform(rngs, -config.blank_error, config.blank_error),
             "sensor_noise_factor": np.exp(spread(rngs, 1.0, config.noise_factor_sd) - 1.0),
             "sensor_blank_counts": spread(rngs, config.blank_counts, config.blank_cv),
+            "sensor_noise_swing": spread(rngs, 1.0, config.noise_swing_sd) - 1.0,
         }
         self.frozen: Mask = np.zeros(n, dtype=bool)
         self.extra_offset: Array = np.zeros(n)
-        self._tape = Tape(noise_rngs, normals=1, uniforms=9)
+        self._tape = Tape(noise_rngs, normals=1 + (config.noise_swing_sd > 0.0), uniforms=9)
         self.reset()
 
     def reset(self) -> None:
-        """Forget past readings: no bubble in the light path, nothing frozen by chance, no noise carried over."""
+        """Forget past readings: no bubble, no frozen reading, no correlated noise."""
         n = self.frozen.size
-        self._noise = np.zeros(n)
+        self._noise, self._swing = np.zeros(n), self.draws["sensor_noise_swing"]
         self._bubble, self._bubble_left, self._freeze_left = np.zeros(n), np.zeros(n), np.zeros(n)
         self._last = np.full(n, np.nan)
 
     def apparent(self, od: Array, wall: Array, minutes: float) -> Array:
-        """Compute what a noise-free sensor would show, OD, shape (N,).
+        """Compute the reading of a noise-free sensor, OD, shape (N,).
 
         Args:
           od: suspended biomass in the light path, shape (N,); wall: biomass on the wall, OD-equivalent, shape (N,).
@@ -115,12 +122,16 @@ class OdSensor:
         return np.asarray(optical + self.config.wall_gain * wall + offset)
 
     def read(self, od: Array, wall: Array, minutes: float) -> Array:
-        """One averaged reading with everything that is configured; arguments as `apparent`, OD, shape (N,)."""
+        """Take one averaged reading with all errors; arguments as `apparent`, OD, shape (N,)."""
         c = self.config
-        (z,), u = self._tape.next()
+        (z, *swing), u = self._tape.next()
         clean = self.apparent(od, wall, minutes)
         self._noise = c.lag1 * self._noise + np.sqrt(1.0 - c.lag1**2) * z
         sd = np.hypot(c.noise_floor, c.noise_relative * clean) * self.draws["sensor_noise_factor"]
+        for z in swing:
+            kept = np.exp(-1.0 / c.noise_swing_min)
+            self._swing = kept * self._swing + np.sqrt(1.0 - kept**2) * c.noise_swing_sd * z
+            sd = sd * np.exp(self._swing)
         value = clean + sd * self._noise + self._misreading(u)
         if c.quantised:
             blank = np.round(self.draws["sensor_blank_counts"])
@@ -133,9 +144,9 @@ class OdSensor:
         return self._last.copy()
 
     def _misreading(self, u: Array) -> Array:
-        """Isolated outliers and bubbles of this reading, OD, shape (N,)."""
+        """Draw isolated outliers and bubbles of this reading, OD, shape (N,)."""
         c = self.config
-        # jumps start at 0.04 (the threshold they were counted with); beyond it an exponential tail of 0.05 OD
+        # jumps start at 0.04 (the threshold of their count), with an exponential tail of 0.05 OD
         jump = (0.04 - 0.05 * np.log1p(-u[1])) * np.where(u[2] < 0.54, 1.0, -1.0)
         outlier = np.where(u[0] < c.outlier_rate, jump, 0.0)
         starts = (self._bubble_left <= 0) & (u[3] < c.bubble_rate)

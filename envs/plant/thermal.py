@@ -35,7 +35,7 @@ class ThermalConfig:
 
 
 class Thermal:
-    """N heated vials. The thermostat goes by its thermometer, whose `offset` a vial keeps; cells feel the truth.
+    """N heated vials. The thermostat uses its thermometer with the vial's `offset`; cells follow the true temperature.
 
     Args: config: heater and surroundings; rngs: one stream per vial, for its thermometer.
     State, shape (N,), degC: `temperature`, `target` of the thermostat (0 = off), `mean` of the last interval.
@@ -47,7 +47,7 @@ class Thermal:
         self.offset = self.draws["thermometer_offset"]
 
     def reset(self, temperature: Array | float) -> None:
-        """Vial and thermostat where the thermometer shows `temperature`, degC, scalar or shape (N,)."""
+        """Set vial and thermostat so that the thermometer shows `temperature`, degC, scalar or shape (N,)."""
         shown = np.full(self._n, temperature, dtype=np.float64)
         self.temperature: Array = shown - self.offset
         self.target: Array = shown
@@ -60,20 +60,20 @@ class Thermal:
         self.target = np.where(np.isnan(wanted), self.target, wanted)
 
     def new_minute(self, z: Array) -> None:
-        """Take this minute's draw: standard normal, shape (N,)."""
+        """Set the random draw of this minute: standard normal, shape (N,)."""
         self._ripple = z
 
     def advance(self, minutes: float, kept: Array) -> None:
         """Mix in the medium's temperature, cool passively, heat towards the target without overshoot.
 
-        Args: kept: share of the vial's content that fresh medium has left in it, shape (N,).
+        Args: kept: fraction of the old content after dilution by fresh medium, shape (N,).
         """
         t = self.config
         mixed = t.medium_c + (self.temperature - t.medium_c) * kept
         cooled = t.ambient_c + (mixed - t.ambient_c) * np.exp(-minutes / t.cooling_min)
         heated = np.minimum(self.target - self.offset, cooled + t.heating_c_per_min * minutes)
         self.temperature = np.maximum(cooled, heated)
-        # A vial that reaches its target early in the interval spends only that share of it on the way.
+        # A vial that reaches its target early heats only for that part of the interval.
         rise = self.temperature - mixed
         share = np.where(rise > 0.0, np.minimum(rise / (t.heating_c_per_min * minutes), 1.0), 1.0)
         self.mean = self.temperature - 0.5 * rise * share

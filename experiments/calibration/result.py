@@ -163,7 +163,7 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
     ]
     if v.outside_pct is not None:
         lines.append(
-            f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, started afresh"
+            f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, from a new start"
         )
     for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
         if drift is not None and drift.significant:
@@ -189,7 +189,7 @@ def _disturbances(result: Calibration) -> list[str]:
     return [
         f"  bench       doses spread by {doses}; {late} of a dose shows one reading late; "
         f"readings by {100 * q.noise:.1f} %",
-        f"  culture     growth wanders by {growth} from hour to hour",
+        f"  culture     growth rate fluctuates by {growth} from hour to hour",
     ]
 
 

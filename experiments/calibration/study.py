@@ -103,7 +103,7 @@ def coverage(config: CalibrateConfig, folder: Path) -> float:
         save(coverage_figure(*intervals, truth, f"{title} (seed {protocol.seed})"), folder / "figures", "coverage")
         for name in ("mu", "tau"):
             print(
-                f"{name}: 95 % intervals hold the truth in {numbers['coverage_pct'][name]:.1f} %, median bias "
+                f"{name}: 95 % intervals contain the true value in {numbers['coverage_pct'][name]:.1f} %, median bias "
                 f"{numbers['median_bias_pct'][name]:+.2f} %, half width "
                 f"{numbers['relative_half_width_pct'][name]:.1f} %"
             )

@@ -205,7 +205,7 @@ def judged(
     if unsafe := [check for check in again if check.kind == SAFETY]:
         what = _listed(unsafe)
         other = "choose another bench or scenario, or train for this one"
-        return Opinion([f"proven anew for this bench and scenario, it is not safe: {what} ({other})"], told)
+        return Opinion([f"certified again for this bench and scenario, it is not safe: {what} ({other})"], told)
     return Opinion([], told)
 
 
@@ -214,12 +214,12 @@ def _unfit(
 ) -> str:
     """Return why a certificate does not allow this policy at these setpoints, with the remedy; "" where it does."""
     if different := stored.differs(policy, settings):
-        return f"its certificate {path} is of another: {'; '.join(different)} (put it back, or {remedy})"
+        return f"its certificate {path} is for another: {'; '.join(different)} (put it back, or {remedy})"
     if not stored.safe:
-        what = _listed([check for check in stored.failed if check.kind == SAFETY]) or "it does not say why"
+        what = _listed([check for check in stored.failed if check.kind == SAFETY]) or "it has no reason"
         return f"by its certificate it is not safe: {what} ({BETTER}, then {remedy})"
     if laxer := stored.config.laxer():
-        return f"its certificate asks for less than it should: {'; '.join(laxer)} ({remedy})"
+        return f"its certificate is less strict than required: {'; '.join(laxer)} ({remedy})"
     if stored.config.quick and stored.bounds is not None:
         return f"its certificate is a quick one, without errors of the gain ({remedy})"
     low, high = stored.setpoints

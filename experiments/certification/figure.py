@@ -24,20 +24,20 @@ def figure(found: Certificate) -> Figure:
         widths.plot(middle, shown * proof.law_half_width, color=colour, linewidth=0.9, linestyle=":")
         entries.plot(middle, shown * (proof.later if asked.late else proof.entry), color=colour, linewidth=1.3)
     widths.set(xlabel=asked.what, ylabel=f"half-width, {asked.unit}", ylim=(0.0, None))
-    widths.set_title("Band that is entered and never left (dotted: the one-line law)")
-    if np.isfinite(widths.dataLim.intervaly).all():  # else neither the policy nor the one-line law has a band
+    widths.set_title("Band that the loop enters and never leaves (dotted: the one-line controller)")
+    if np.isfinite(widths.dataLim.intervaly).all():  # else neither the policy nor the one-line controller has a band
         widths.set(yscale="log", ylim=(0.7 * widths.dataLim.y0, 8.0 * widths.dataLim.y1))
     widths.legend(ncols=2, fontsize=7, loc="upper right")
-    what = "periods after the one-line law" if asked.late else "entry time over the pump's own"
+    what = "periods after the one-line controller" if asked.late else "entry time over the pump's own"
     entries.set(xlabel=asked.what, ylabel=what)
     entries.set_title("Time into the band, from anywhere in the range of starts")
     for colour, level, depth in zip(COLOURS, found.levels, found.doses, strict=False):
         doses.plot(middle, depth, color=colour, linewidth=1.3, label=f"action {level} and higher")
     doses.set(xlabel=asked.what, ylabel="periods of growth", ylim=(0, None))
-    doses.set_title("How far below the setpoint a dose may still be given")
+    doses.set_title("Largest distance below the setpoint with a dose")
     doses.legend()
     if failed := found.failed(SAFETY) or found.failed(PERFORMANCE):
-        said = "Safe, but short of performance" if found.safe else "Not safe"
+        said = "Safe, but performance falls short" if found.safe else "Not safe"
         made.suptitle(f"{said}: {len(failed)} of {len(found.checks)} requirements fail, first {failed[0].name}")
     return made
 

@@ -73,7 +73,7 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     """
     if policy.observation not in (ABSOLUTE, RELATIVE):
         seen = ", ".join(policy.observation)
-        raise CertificationError(f"it sees ({seen}); what is proven is how a density is held")
+        raise CertificationError(f"it sees ({seen}); only density policies can be certified")
     said = policy.metadata.get("model", {})
     model = config.env
     if policy.observation == RELATIVE:
@@ -81,7 +81,7 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
         return model or EnvConfig(tau=bench.tau, control_min=bench.control_min, max_pump_rate=bench.max_rate)
     if model is None:
         if not {"mu", "tau"} <= set(said):
-            raise CertificationError("it does not say which model it was trained on; give env.mu=MU env.tau=TAU")
+            raise CertificationError("it has no model of its training; give env.mu=MU env.tau=TAU")
         model = build(EnvConfig(), {k: said[k] for k in MODEL if k in said})
     period = float(policy.metadata.get("control_min", model.control_min))
     if abs(period - model.control_min) > 1e-9:

@@ -1,3 +1,3 @@
 """From a command line to a checked config and a run folder; how a command ends.
 
-Commands enter here first. Rooms take `UserError` from here. Imports of ours: conf, the atomic writer, tables."""
+Commands import this room first; other rooms import `UserError`. It imports conf, the atomic writer and tables."""

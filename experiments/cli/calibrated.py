@@ -14,17 +14,17 @@ T = TypeVar("T")
 
 
 def read_env_file(path: str) -> EnvConfig:
-    """Read the model of a calibrated.yaml. Raises: UserError naming the file and what is wrong with it."""
+    """Read the model of a calibrated.yaml. Raises: UserError with file and reason."""
     return _read("env_file", path, "calibrated.yaml", EnvConfig(), "env")
 
 
 def read_plant_file(path: str) -> PlantConfig:
-    """Read the plant of a twin.yaml. Raises: UserError naming the file and what is wrong with it."""
+    """Read the plant of a twin.yaml. Raises: UserError with file and reason."""
     return _read("plant_file", path, "twin.yaml", PlantConfig(), "plant")
 
 
 def _read(key: str, path: str, usual: str, default: T, prefix: str) -> T:
-    """`default` with what the file says. Raises: UserError."""
+    """Return `default` with the values of the file. Raises: UserError."""
     remedy = f"give the {usual} of a calibration run"
     try:
         content = files.load_yaml(path)

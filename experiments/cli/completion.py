@@ -1,4 +1,4 @@
-"""What a shell offers on Tab: commands, groups with their presets, keys part by part, and the values of a choice."""
+"""Completion in the shell: commands, groups with their presets, keys part by part, and the values of a choice."""
 
 import importlib
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ complete -c turbidostat -a '(turbidostat complete (commandline -cp | string coll
 
 
 def candidates(line: str, commands: list[str]) -> list[str]:
-    """List the words that may stand in place of the last one of a command line.
+    """List the possible last words of a command line.
 
     Args: line: up to the cursor, the program's name first. commands: names of all commands.
     """
@@ -74,7 +74,7 @@ def _of_command(name: str, before: list[str], last: str) -> Iterator[str]:
 
 
 def _config(command: EntryPoint[Any], words: list[str]) -> Any:
-    """Compose the config of the rest of the line; the default where the line is not valid yet."""
+    """Compose the config of the rest of the line; the default if the line is not valid yet."""
     try:
         return command.config([w for w in words if not w.startswith("-")])
     except (UserError, ValueError):
@@ -82,7 +82,7 @@ def _config(command: EntryPoint[Any], words: list[str]) -> Any:
 
 
 def _keys(config: Any, parts: list[str], values: bool) -> Iterator[str]:
-    """Keys of the part that `parts` leads to, or with `values` what they may be."""
+    """List the keys of the part at `parts`, or with `values` their possible values."""
     prefix = "".join(f"{part}." for part in parts)
     for part in parts:
         config = config.get(part) if isinstance(config, dict) else getattr(config, part, None)

@@ -1,8 +1,7 @@
-"""What a user adds without touching the program: Python files by `extend=FILE.py`, presets by `group=FILE.yaml`.
+"""Extensions by a user: Python files by `extend=FILE.py`, presets by `group=FILE.yaml`.
 
-A Python file registers what it brings (docs/extending.md) when it is loaded. The variable `TURBIDOSTAT_EXTEND` tells
-every process that a command starts, and every job that a cluster starts for it, which files those are. The run folder
-keeps a copy, which `resume=RUN` loads.
+A Python file registers its extensions (docs/extending.md) when it is loaded. The variable `TURBIDOSTAT_EXTEND` lists
+the files for all processes and cluster jobs of a command. The run folder keeps a copy, which `resume=RUN` loads.
 """
 
 import importlib.util
@@ -23,12 +22,12 @@ from experiments.cli import files
 __all__ = ["VARIABLE", "keep", "kept", "load_all", "offer", "preset_file", "taken"]
 
 VARIABLE, FOLDER = "TURBIDOSTAT_EXTEND", "extensions"
-RECIPES = ("experiment", "hparams_search")  # groups whose presets stand at the root of the config
+RECIPES = ("experiment", "hparams_search")  # groups whose presets are at the root of the config
 _loaded: dict[Path, str] = {}  # file -> name of its module
 
 
 def taken(argv: Sequence[str]) -> list[str]:
-    """Arguments without `extend=FILE.py[,FILE.py]`; those files are loaded here and in every process started later.
+    """Load the files of `extend=FILE.py[,FILE.py]`, here and in processes started later; return the other arguments.
 
     Raises: ValueError naming a file and what is wrong with it.
     """
@@ -65,18 +64,18 @@ def _load(path: Path) -> None:
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"extend={path}: no Python file")
-    sys.modules[module] = importlib.util.module_from_spec(spec)  # so that what it defines can be sent to a worker
+    sys.modules[module] = importlib.util.module_from_spec(spec)  # so that its definitions can be sent to a worker
     try:
         spec.loader.exec_module(sys.modules[module])
     except Exception as error:
         del sys.modules[module]
         line = _line_in(path, error)
-        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; mend that file") from None
+        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; correct that file") from None
     _loaded[path] = module
 
 
 def _line_in(path: Path, error: Exception) -> str:
-    """Where in the file it went wrong, ":12"."""
+    """Return the line of the error in the file, ":12"."""
     numbers = [error.lineno or 0] if isinstance(error, SyntaxError) else []
     numbers += [line for stack, line in walk_tb(error.__traceback__) if stack.f_code.co_filename == str(path)]
     return f":{numbers[-1]}" if numbers else ""
@@ -107,7 +106,7 @@ def preset_file(group: str, option: str) -> str:
 
 
 def offer() -> None:
-    """Hydra finds the presets that were added."""
+    """Offer the added presets to Hydra."""
     for name, preset in presets.added().items():
         group, _, option = name.rpartition("/")
         package = "_global_" if group in RECIPES else None
@@ -124,7 +123,7 @@ def keep(folder: Path) -> None:
 
 
 def kept(folder: Path) -> None:
-    """Load the files that a run folder keeps, if it keeps any. Raises: ValueError as `taken`."""
+    """Load the extension files in a run folder, if any. Raises: ValueError as `taken`."""
     names = set(_loaded.values())
     _remember([str(path.resolve()) for path in sorted((folder / FOLDER).glob("*.py")) if path.stem not in names])
     load_all()

@@ -1,4 +1,4 @@
-"""JSON as every command writes it, whole or not at all; YAML as every command reads it; how a run was started."""
+"""JSON files of all commands, written atomically; YAML files as all commands read them; command line of a run."""
 
 import io
 import json
@@ -19,7 +19,7 @@ __all__ = ["choices", "given", "load_yaml", "plain", "write_json"]
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:
-    """Load a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
+    """Load a YAML file without aliases and interpolations, because a few lines of those can expand to gigabytes.
 
     Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
     """
@@ -28,7 +28,7 @@ def load_yaml(path: Path | str) -> DictConfig | ListConfig:
         return OmegaConf.load(io.StringIO(text))
     except ValueError:
         raise
-    except Exception as error:  # whatever PyYAML and OmegaConf meet
+    except Exception as error:  # various errors of PyYAML and OmegaConf
         raise ValueError(f"not YAML ({problem(error)})") from None
 
 
@@ -41,7 +41,7 @@ BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
 
 
 def given(folder: Path) -> list[str]:
-    """List the words of the command line of a run folder, `key=value` each; [] where it does not say."""
+    """List the arguments of a run folder's command line, `key=value` each; [] if unknown."""
     with suppress(OSError, ValueError, yaml.YAMLError):
         words = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
         return [str(word).lstrip("+") for word in words] if isinstance(words, list) else []
@@ -49,7 +49,7 @@ def given(folder: Path) -> list[str]:
 
 
 def choices(folder: Path) -> dict[str, str]:
-    """Map group to preset of a run folder, {} where it does not say; a group without a preset is left out."""
+    """Map group to preset of a run folder, without groups that have no preset; {} if unknown."""
     path = folder / ".hydra" / "hydra.yaml"
     block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
     pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))

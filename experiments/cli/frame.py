@@ -1,6 +1,6 @@
 """The frame of every entry point: command line -> Hydra -> checked dataclass -> run folder.
 
-Hydra composes plain YAML; the dataclass of the entry point is the schema. Whatever does not fit it (unknown key,
+Hydra composes plain YAML; the dataclass of the entry point is the schema. An argument that does not fit (unknown key,
 wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
 """
 
@@ -36,12 +36,12 @@ __all__ = ["EntryPoint", "UserError", "compose", "load", "normalise", "refusing"
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
+for talker in ("httpx", "torch"):  # of every request, as journal and summary do; of its caches at the end
     logging.getLogger(talker).setLevel(logging.WARNING)
 
 
 class _Once(logging.Filter):
-    """Says a warning of another library that counts its calls once, by the log alone; it has handlers of its own."""
+    """Filter that passes a repeated warning of another library once, only to the log."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ REFUSALS = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), SPACE),
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG), PLACE),
 }
-"""What a disk answers that will not take a file, and the remedy."""
+"""Errors of a disk that refuses a file, and the remedies."""
 
 
 OPTIONS = frozenset((
@@ -75,7 +75,7 @@ OPTIONS = frozenset((
     "--multirun", "-sc", "--shell-completion", "-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir",
     "--experimental-rerun", "-i", "--info",
 ))  # fmt: skip
-"""Words that begin with a dash: ours and Hydra's."""
+"""Options that begin with a dash, of this program and of Hydra."""
 SEVERAL = re.compile(r"(?:Sweep parameters|Ambiguous value for argument) '\+*(.+?)'(?:,| |$)")
 
 
@@ -90,9 +90,9 @@ def _one_line(error: Exception) -> str:
 
 
 def _refusal(error: BaseException | None) -> str | None:
-    """Word the refusal of a disk, None for any other error.
+    """Return the message for a disk error, None for any other error.
 
-    Whoever wrote may have wrapped the system's error in one of its own, as torch and logging do.
+    The writer may have wrapped the system's error in its own, as torch and logging do.
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno in REFUSALS:
@@ -102,13 +102,13 @@ def _refusal(error: BaseException | None) -> str | None:
 
 
 def _in_thread(failed: threading.ExceptHookArgs) -> None:
-    """Hand a refusal in an event writer's thread on to the run, which reports it; show everything else."""
+    """Pass a disk error in an event writer's thread to the run, which reports it; show other errors."""
     if _refusal(failed.exc_value) is None:
         threading.__excepthook__(failed)
 
 
 def _silence(stream: TextIO) -> None:
-    """Nothing more goes out there, also not at the interpreter's end."""
+    """Close a stream for good, so that the interpreter's end writes nothing either."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -117,8 +117,8 @@ def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
 
     Args:
       schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
-      prefix: where the config stands, for messages.
-    Raises: UserError naming key, value and what is allowed.
+      prefix: key of the config, for messages.
+    Raises: UserError with key, value and allowed values.
     """
     try:
         values = OmegaConf.to_container(cfg, resolve=True)
@@ -128,7 +128,7 @@ def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
 
 
 def compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    """Compose `conf/<name>.yaml` with command-line overrides, as the entry point would.
+    """Compose `conf/<name>.yaml` with command-line overrides, as the entry point does.
 
     Raises: UserError with Hydra's message on one line.
     """
@@ -143,17 +143,17 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def swept() -> bool:
-    """Whether what runs here is a job of a sweep."""
+    """Return whether this run is a job of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def save_config(config: Any, folder: Path) -> None:
-    """Write the checked config as `config.yaml`: what `resume=` and `--config-name` read back."""
+    """Write the checked config as `config.yaml`, which `resume=` and `--config-name` read."""
     OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
 
 
 def _stored(path: Path, resume: str, schema: T) -> T:
-    """Read the config a run was started with. Raises: UserError naming the file and what is wrong with it."""
+    """Read the config of a run. Raises: UserError with file and reason."""
     try:
         stored = files.load_yaml(path)
         if not isinstance(stored, DictConfig):
@@ -172,13 +172,13 @@ def _stored(path: Path, resume: str, schema: T) -> T:
 
 @dataclass(frozen=True)
 class EntryPoint(Generic[T]):
-    """An entry point, called to run; its resolved config is in `config.yaml` of its run folder before `body` starts.
+    """An entry point; a call runs it. `config.yaml` of the run folder has its config before `body` starts.
 
     name: of `conf/<name>.yaml` and of the job.
     schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
-    body: called with the checked config and the run folder; a float it returns is the sweep's objective.
-    resumes: the file in a run folder without which `resume=` cannot go on, "" for a command that has no `resume=`.
-    goes_on: a job of a sweep that was stopped goes on from that file by itself, to the same result; others start anew.
+    body: called with the checked config and the run folder; may return the sweep's objective.
+    resumes: file of a run folder that `resume=` needs, "" for a command without `resume=`.
+    goes_on: a stopped job of a sweep continues from that file, to the same result; otherwise it starts again.
     """
 
     name: str
@@ -193,34 +193,34 @@ class EntryPoint(Generic[T]):
         return load(cfg, self.schema)
 
     def __call__(self) -> None:
-        """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
-        logging.raiseExceptions = False  # a log that cannot be written costs its line, not the run
+        """Run the command line. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
+        logging.raiseExceptions = False  # a failed log line must not stop the run
         threading.excepthook = _in_thread
         try:
             with stop.interrupts(), stop.unmasked():
                 self._answer(sys.argv[1:])
             sys.stdout.flush()
-        except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
+        except BrokenPipeError:  # `--help | head`: the reader has closed the pipe
             _silence(sys.stdout)
         except KeyboardInterrupt:
             print(stopped(), file=sys.stderr)
             sys.exit(stop.STATUS)
         except Exception as error:
             line = _refusal(error)
-            if isinstance(error, FileNotFoundError):  # no folder can be made there, as under /proc
+            if isinstance(error, FileNotFoundError):  # no folder can be created there, e.g. under /proc
                 line = f"{error.filename}: {error.strerror}; {PLACE}"
             if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
-                line = _one_line(error)  # a ValueError is the schema's own word on a value
+                line = _one_line(error)  # a ValueError is the schema's message about a value
             inside = any(stack.f_code is EntryPoint._job.__code__ for stack, _ in walk_tb(error.__traceback__))
-            if line is None or inside:  # a bug of ours, shown whole
+            if line is None or inside:  # a bug of this program, with its traceback
                 raise
             print(f"error: {line}", file=sys.stderr)
             if isinstance(error, OSError) and error.filename is None:
-                _silence(sys.stdout)  # it was standard output that refused
+                _silence(sys.stdout)  # standard output failed
             sys.exit(1)
 
     def _answer(self, given: list[str]) -> None:
-        """Help, the config, or a run or sweep of it."""
+        """Show the help or the config, or start a run or sweep."""
         with refusing(ValueError):
             given = [latest.resolved(arg, self.name) for arg in given]
         flags = {a for a in given if a.startswith("-")}
@@ -241,11 +241,11 @@ class EntryPoint(Generic[T]):
             plain.remove("job")
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
-        if flags <= set(sweep.FLAGS) and (swept := sweep.asked(given, self.name)):  # other flags are Hydra's to read
+        if flags <= set(sweep.FLAGS) and (swept := sweep.asked(given, self.name)):  # Hydra reads other flags
             self._sweep(swept)
             return
         sys.argv[1:] = normalise(given, self.name)
-        if not flags:  # a plain run is checked before it has a folder
+        if not flags:  # a single run is checked before its folder exists
             self.config(given)
             resumed = words.resumed(given)
             others = [a for a in given if not a.startswith(("resume=", "hydra."))]
@@ -259,11 +259,11 @@ class EntryPoint(Generic[T]):
         if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
             sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
         GlobalHydra.instance().clear()
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its error; the message is decided above
         hydra.main(config_path="pkg://conf", config_name=self.name, **BASE)(self._job)()
 
     def _sweep(self, swept: sweep.Sweep) -> None:
-        """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
+        """Run every job of a sweep, and log how many finished. Exits: 1 if one failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
         self._refuse([swept.arguments] if expected is None else expected)
@@ -275,7 +275,7 @@ class EntryPoint(Generic[T]):
         except (KeyboardInterrupt, SystemExit):
             print(f"stopped; {sweep.progress(swept, expected)}", file=sys.stderr)
             sys.exit(stop.STATUS)
-        except Exception:  # a bug in a job, which Hydra raises again once all have ended; or in a launcher
+        except Exception:  # a bug in a job, which Hydra raises again after all jobs; or in a launcher
             print(sweep.progress(swept, expected), file=sys.stderr)
             raise
         errors = sweep.errors(swept.folder, expected)
@@ -284,7 +284,7 @@ class EntryPoint(Generic[T]):
             sys.exit(1)
 
     def _refuse(self, jobs: list[list[str]]) -> None:
-        """Refuse words that no job can take, before a folder is made. Raises: UserError of the first job."""
+        """Refuse invalid arguments before a folder is created. Raises: UserError of the first job."""
         refusals = []
         for job in jobs:
             try:
@@ -296,9 +296,9 @@ class EntryPoint(Generic[T]):
             raise refusals[0]
 
     def _job(self, cfg: DictConfig) -> float | None:
-        """One run in its folder."""
+        """Run once in a folder."""
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
-        extensions.load_all()  # in a worker of a sweep they are not loaded yet
+        extensions.load_all()  # not loaded yet in a worker of a sweep
         if swept():
             return self._swept_job(cfg, folder)
         try:
@@ -313,7 +313,7 @@ class EntryPoint(Generic[T]):
         except KeyboardInterrupt:
             print(f"stopped; {self._left(folder)}", file=sys.stderr)
             sys.exit(stop.STATUS)
-        except BrokenPipeError:  # whoever read has seen enough
+        except BrokenPipeError:  # the reader has closed the pipe
             _silence(sys.stdout)
             return None
         except Exception as error:
@@ -324,13 +324,13 @@ class EntryPoint(Generic[T]):
             sys.exit(1)
 
     def _swept_job(self, cfg: DictConfig, folder: Path) -> float | None:
-        """One job of a sweep: what it has done before stands, also if the process that did it was killed.
+        """Run one job of a sweep; earlier results remain, also those of a killed process.
 
-        A job that fails is written down as such; the launcher goes on with the others.
+        A failed job is recorded; the launcher continues with the others.
         """
         try:
             searched = HydraConfig.get().runtime.choices.get("hparams_search") not in (None, "null")
-            with sweep.working(folder, wait=searched):  # a search needs the result, whoever finds it
+            with sweep.working(folder, wait=searched):  # a search needs the result of any process
                 return self._once(cfg, folder, sweep.Job.at(folder))
         except KeyboardInterrupt:
             sys.exit(stop.STATUS)
@@ -339,7 +339,7 @@ class EntryPoint(Generic[T]):
             return None
 
     def _once(self, cfg: DictConfig, folder: Path, job: sweep.Job) -> float | None:
-        """Run what is missing of a job."""
+        """Run the missing part of a job."""
         try:
             config = load(cfg, self.schema)
             job.begin(config)
@@ -360,8 +360,8 @@ class EntryPoint(Generic[T]):
             return None
         except Exception as error:
             line = _refusal(error) or _one_line(error) or type(error).__name__
-            if job.state != "finished":  # what it found stands, whatever was asked of it now
-                with suppress(OSError):  # a disk that is full
+            if job.state != "finished":  # its result remains for any new arguments
+                with suppress(OSError):  # a full disk
                     job.save("failed", error=line)
             if not isinstance(error, UserError) and _refusal(error) is None:
                 raise
@@ -369,7 +369,7 @@ class EntryPoint(Generic[T]):
             return None
 
     def _left(self, folder: Path) -> str:
-        """Say what a run that did not come to its end leaves, and how to go on."""
+        """Describe the state of an unfinished run and how to continue it."""
         own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$|reactors$|agents$")
         names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"

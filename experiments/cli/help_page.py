@@ -1,6 +1,6 @@
-"""What `--help` prints: how a command is used, what can be chosen, and the values with meaning and range.
+"""Text of `--help`: usage, presets, and values with meaning and range.
 
-Usage is the comment that opens conf/NAME.yaml; all else comes from the fields of the command's config.
+Usage is the opening comment of conf/NAME.yaml; the rest comes from the fields of the command's config.
 """
 
 import textwrap
@@ -32,7 +32,7 @@ def shown(value: Any) -> str:
 
 
 def _line(left: str, right: str, at: int) -> list[str]:
-    """Two columns; the right one is wrapped."""
+    """Format two columns; wrap the right one."""
     lines = textwrap.wrap(right, WIDTH - at) or [""]
     head = [left] if len(left) > at - 2 else []
     lines[0] = (" " * at if head else left.ljust(at)) + lines[0]
@@ -40,7 +40,7 @@ def _line(left: str, right: str, at: int) -> list[str]:
 
 
 def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
-    """List the plain values of a config, then its parts, each below its own line; without `deep` a line for each."""
+    """List the plain values of a config, then its parts with their values; without `deep` one line per part."""
     parts: list[tuple[str, str, Any]] = []
     default = type(config)()
     for entry in entries(config):
@@ -80,7 +80,7 @@ def _group(name: str, group: str, start: str | None) -> list[str]:
 
 
 def _short(name: str, config: Any) -> list[str]:
-    """Examples, what can be chosen, and the command's own keys; of a part its name."""
+    """Write examples, presets, and the command's own keys; only the names of parts."""
     choices = [
         line
         for group, start in chosen(name).items()
@@ -117,7 +117,7 @@ def text(name: str, config: Any, about: str = "") -> str:
 
     Args: name: of the command; config: what it would run with; about: "all", a group or a part of the config with its
       own values; "": what one looks for first.
-    Raises: ValueError for an `about` that there is not.
+    Raises: ValueError for an unknown `about`.
     """
     if not about:
         return "\n".join(_short(name, config))

@@ -1,4 +1,4 @@
-"""`latest`: what a command wrote last below runs/, so that a line can be typed without a folder's name."""
+"""`latest`: the newest output of a command below runs/, as a value without a folder's name."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ WRITTEN = {
     "run": (("deploy/*/recordings", "demo/*/4_deploy/recordings"), "deploy"),
 }
 """Key -> where its files are below runs/, and the command that writes them."""
-FOLDERS = ("resume", "runs", "run")  # keys that are given the folder of the file that is found
+FOLDERS = ("resume", "runs", "run")  # keys that get the folder of the found file
 
 
 def newest(patterns: Sequence[str]) -> Path | None:
@@ -23,15 +23,14 @@ def newest(patterns: Sequence[str]) -> Path | None:
 
 
 def resolved(arg: str, command: str) -> str:
-    """`latest` of these keys and of `resume` with the path in its place, any other word as it is.
+    """Replace `latest` of these keys and of `resume` by the path; return other arguments unchanged.
 
-    Args: command: whose run is resumed.
-    Raises: ValueError where nothing was written yet, saying what writes it.
+    Args: command: of the resumed run. Raises: ValueError without a file, with the command that writes it.
     """
     key, _, value = arg.partition("=")
     name = key.lstrip("+")
     if value != "latest" or name not in (*WRITTEN, "resume") or (name == "run" and command != "mark"):
-        return arg  # report finds the newest run of any command by itself
+        return arg  # report itself finds the newest run of any command
     runs = tuple(f"{command}/*/{name}" for name in ("checkpoint.pt", "state.json", "sweep.json"))
     patterns, writer = WRITTEN.get(name, (runs, command))
     path = newest(patterns)

@@ -1,4 +1,4 @@
-"""Output that no caller waits for: a bounded queue, and a thread that writes it."""
+"""Output without waiting: a bounded queue, and a thread that writes it."""
 
 import atexit
 import logging
@@ -14,7 +14,7 @@ from typing import Any, Generic, TextIO, TypeVar
 __all__ = ["Outlet", "Screen", "detach"]
 
 T = TypeVar("T")
-LAST_S, WAITING = 2.0, 2000  # for what is left at the end of a program; pieces of output that may wait
+LAST_S, WAITING = 2.0, 2000  # for remaining output at the end of a program; largest number of waiting pieces
 
 
 class Outlet(Generic[T]):
@@ -25,7 +25,7 @@ class Outlet(Generic[T]):
 
     def __init__(self, send: Callable[[T], None], size: int) -> None:
         self._send, self._size, self._over, self.dropped = send, size, False, 0
-        self._waiting: queue.SimpleQueue[T | None] = queue.SimpleQueue()  # a signal's handler may put into it as well
+        self._waiting: queue.SimpleQueue[T | None] = queue.SimpleQueue()  # a signal's handler may also put items
         self._thread = threading.Thread(target=self._deliver, daemon=True)
         self._thread.start()
 
@@ -38,7 +38,7 @@ class Outlet(Generic[T]):
 
     def _deliver(self) -> None:
         while (one := self._waiting.get()) is not None and not self._over:
-            with suppress(OSError):  # nobody will ever read it
+            with suppress(OSError):  # there is no reader
                 self._send(one)
 
     def close(self, within_s: float) -> int:
@@ -58,7 +58,7 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Queue the text; return its length."""
-        told = f"... {self._lines} lines are missing here, nobody read them; the log file has all\n"
+        told = f"... {self._lines} lines are missing here, because the screen was blocked; the log file has all\n"
         room = self.outlet.put((told * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
         self._lines = 0 if room else self._lines + text.count("\n")
         return len(text)

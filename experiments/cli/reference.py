@@ -22,7 +22,7 @@ from experiments.reporting.tables import markdown
 __all__ = ["page"]
 
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
-SINGULAR = {"studies": "study"}  # the others lose their s
+SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
 This page is generated from the fields of the config dataclasses and the presets of `conf/`, and a test compares it with
@@ -68,7 +68,7 @@ def _said(name: str) -> str:
 
 
 def _anchor(heading: str) -> str:
-    """Where a heading is found in the page."""
+    """Return the anchor of a heading."""
     return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
 
 
@@ -82,7 +82,7 @@ def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
 
 
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
-    """Every part below a config with the name it is first met by."""
+    """Collect every part below a config with its first name."""
     for entry in entries(config):
         values, name = [entry.value], entry.name
         if isinstance(entry.value, dict):
@@ -95,7 +95,7 @@ def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
 
 
 def _part(config: Any, entry: Entry) -> type[Any] | None:
-    """Return the kind of part that a field holds, itself or by name."""
+    """Return the class of a field's part, or of its parts by name."""
     of: Any = type(entry.value)
     if of is dict:
         of = get_args(get_type_hints(type(config))[entry.name])[1]

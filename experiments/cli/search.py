@@ -1,9 +1,8 @@
-"""Hydra's jobs one after the other, each at values that Optuna chooses from the results of the earlier ones.
+"""Consecutive Hydra jobs at values that Optuna chooses from the results of earlier jobs.
 
-Any number of processes share one search: whoever is started with the same `hydra.sweep.dir` takes part. A trial that
-its process did not end is taken up by the next one that looks, in the same folder. hydra-optuna-sweeper 1.3.0 does
-neither: it stands on Optuna 2, whose shared storage needs SQLAlchemy 1, numbers the folders of each process from 0, and
-leaves a killed trial running for ever.
+All processes with the same `hydra.sweep.dir` share one search. Another process continues an unfinished trial in the
+same folder. hydra-optuna-sweeper 1.3.0 does neither: it needs Optuna 2, whose shared storage needs SQLAlchemy 1,
+numbers the folders of each process from 0, and leaves a killed trial running without limit.
 """
 
 import fcntl
@@ -28,21 +27,21 @@ __all__ = ["JOURNAL", "Search", "register"]
 
 log = logging.getLogger(__name__)
 
-NAME = "hydra_plugins.search.Search"  # as conf/hydra/sweeper/search.yaml calls it; Hydra takes no other package
+NAME = "hydra_plugins.search.Search"  # as in conf/hydra/sweeper/search.yaml; Hydra accepts no other package
 JOURNAL = "search.journal"
 
 
 def register() -> None:
-    """Make the search known to Hydra. Raises: UserError where Optuna is missing or too old."""
+    """Register the search with Hydra. Raises: UserError if Optuna is missing or too old."""
     try:
-        import_module("optuna.storages.journal")  # which only a search needs
+        import_module("optuna.storages.journal")  # only a search needs it
     except ImportError:
         raise UserError(f"hparams_search: needs optuna 4 or newer; {EXTRA}") from None
     Plugins.instance().class_name_to_class[NAME] = Search
 
 
 def _distribution(name: str, said: Mapping[str, Any]) -> Any:
-    """Read an entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError naming it."""
+    """Read an entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError with the entry."""
     of: Any = import_module("optuna.distributions")
     try:
         if "choices" in said:
@@ -56,11 +55,11 @@ def _distribution(name: str, said: Mapping[str, Any]) -> Any:
 
 
 class Search(Sweeper):
-    """Least objective over a space of values, shared by processes through one file in the sweep's folder.
+    """Minimiser of the objective over a space of values, shared through one file in the sweep's folder.
 
     Args:
-      trials: of the whole search, by all processes in all their lives, failed ones among them.
-      at_once: jobs given to the launcher together. space: dotted key -> what it may be.
+      trials: of the whole search, over all processes and restarts, including failed ones.
+      at_once: jobs per launch. space: dotted key -> allowed values.
     """
 
     def __init__(self, trials: int, at_once: int, space: DictConfig) -> None:
@@ -69,7 +68,7 @@ class Search(Sweeper):
         self._held: dict[int, IO[str]] = {}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """As Hydra calls it, before `sweep`."""
+        """Set up as Hydra requires, before `sweep`."""
         self.hydra_context, self.config = hydra_context, config
         self.folder = Path(str(config.hydra.sweep.dir))
         self.launcher: Launcher = Plugins.instance().instantiate_launcher(
@@ -77,18 +76,18 @@ class Search(Sweeper):
         )
 
     def _open(self) -> Any:
-        """Open the study in the folder, or begin it."""
+        """Open the study in the folder, or create it."""
         optuna: Any = import_module("optuna")
         optuna.logging.set_verbosity(logging.WARNING)
         (self.folder / ".trials").mkdir(parents=True, exist_ok=True)
         file = import_module("optuna.storages.journal").JournalFileBackend(str(self.folder / JOURNAL))
         storage = optuna.storages.JournalStorage(file)
-        sampler = optuna.samplers.TPESampler(constant_liar=True)  # trials at work elsewhere count as poor ones
+        sampler = optuna.samplers.TPESampler(constant_liar=True)  # running trials of other processes count as poor
         with self._alone():
             return optuna.create_study(storage=storage, sampler=sampler, study_name="search", load_if_exists=True)
 
     def sweep(self, arguments: list[str]) -> None:
-        """Trials until there are as many as asked for. Args: arguments: overrides of every trial."""
+        """Run trials until their number is reached. Args: arguments: overrides of every trial."""
         study = self._open()
         while batch := self._take(study):
             overrides = [[*arguments, *self._values(t), f"hydra.sweep.subdir={t.number}"] for t in batch]
@@ -101,12 +100,12 @@ class Search(Sweeper):
         return [f"++{name}={value}" for name, value in trial.params.items()]
 
     def _take(self, study: Any) -> list[Any]:
-        """Trials for the next launch: first those whose process is gone, then new ones while there are any to come."""
+        """Return trials for the next launch: first those whose process has ended, then new ones."""
         taken: list[Any] = []
         with self._alone():
             for trial in study.get_trials(deepcopy=False):
                 if len(taken) < self.at_once and not trial.state.is_finished() and self._hold(trial.number):
-                    log.info("trial %d goes on: its process is gone", trial.number)
+                    log.info("trial %d continues: its process has ended", trial.number)
                     taken.append(trial)
             while len(taken) < self.at_once and len(study.get_trials(deepcopy=False)) < self.trials:
                 trial = study.ask(self.space)
@@ -115,7 +114,7 @@ class Search(Sweeper):
         return taken
 
     def _hold(self, number: int) -> bool:
-        """Take a trial for this process, until its result is in or the process ends; False where another one has it."""
+        """Reserve a trial for this process until its result or the process's end; False if another has it."""
         if number in self._held:
             return False
         file = open(self.folder / ".trials" / str(number), "w")  # noqa: SIM115  (open as long as it is held)
@@ -129,16 +128,16 @@ class Search(Sweeper):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Inside, no other process takes trials."""
+        """Exclude other processes from taking trials in this context."""
         with open(self.folder / ".trials" / "all", "w") as file:
             fcntl.lockf(file, fcntl.LOCK_EX)
             yield
 
     def _tell(self, study: Any, number: int, job: JobReturn) -> None:
-        """Give a result to the study; a job without one has failed."""
+        """Report a result to the study; a job without a result has failed."""
         try:
             study.tell(number, float(job.return_value))
-        except Exception as error:  # whatever the job raised
+        except Exception as error:  # any error of the job
             log.warning("trial %d failed: %s", number, error)
             study.tell(number, state=import_module("optuna").trial.TrialState.FAIL)
         self._held.pop(number).close()

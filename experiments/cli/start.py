@@ -1,4 +1,4 @@
-"""Before a command imports anything: whether the packages are its own, and what Ctrl-C says until it has begun."""
+"""Checks before a command imports anything: origin of the packages, and Ctrl-C during the start."""
 
 import sys
 from importlib import metadata
@@ -9,13 +9,13 @@ from types import TracebackType
 __all__ = ["begin", "stopped", "version"]
 
 PACKAGES = ("conf", "dqn", "envs", "hardware")
-HOME = Path(__file__).parents[2]  # where all packages of ours stand side by side
+HOME = Path(__file__).parents[2]  # folder of all packages of this project
 
 
 def begin() -> None:
     """Refuse packages of other projects. Raises: SystemExit with one line for a command, ImportError for a library."""
     first = Path(sys.argv[0] if sys.argv else "").name
-    command = first in ("-m", "turbidostat")  # the interpreter still looks for the command, or the script imports it
+    command = first in ("-m", "turbidostat")  # the interpreter still searches the command, or the script imports it
     if line := _other_package():
         raise SystemExit(f"error: {line}") if command else ImportError(line)
     if command:
@@ -23,7 +23,7 @@ def begin() -> None:
 
 
 def _other_package() -> str | None:
-    """Find a folder `envs/` of the user's, or another installed package of that name, that comes before ours."""
+    """Find a user's folder `envs/`, or another installed package of that name, that shadows this project's."""
     for name in PACKAGES:
         spec = find_spec(name)
         places = list(spec.submodule_search_locations or [str(spec.origin)]) if spec is not None else []
@@ -41,7 +41,7 @@ def version() -> str:
 
 
 def stopped() -> str:
-    """Word a stop before anything began; a run that was to be resumed may have left a pump on."""
+    """Write the message of a stop before the start; the run to resume may have left a pump on."""
     words = sys.orig_argv
     deploys = any(Path(word).name in ("deploy", "deploy.py", "experiments.deploy") for word in words)
     resumed = deploys and any(word.lstrip("+").startswith("resume=") for word in words)
@@ -49,7 +49,7 @@ def stopped() -> str:
 
 
 def _shown(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Ctrl-C while a command is imported; a traceback through other people's modules tells nobody anything."""
+    """Handle Ctrl-C during the import of a command without a useless traceback."""
     if issubclass(kind, KeyboardInterrupt):
         print(stopped(), file=sys.stderr)
     else:

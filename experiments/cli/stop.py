@@ -1,4 +1,4 @@
-"""How a command stops: Ctrl-C, SIGTERM and SIGHUP alike; and worker processes that never outlive it."""
+"""Stop of a command by Ctrl-C, SIGTERM or SIGHUP, and worker processes that end with it."""
 
 import logging
 import multiprocessing
@@ -26,14 +26,14 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # how a batch system says that a job's time is nearly over
-STATUS = 130  # of a stopped command, as shells have it for Ctrl-C
-AGAIN_S = 0.1  # after which a stop that was lost is raised once more
+CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # signals of a batch system before a job's time limit
+STATUS = 130  # exit status of a stopped command, as in shells for Ctrl-C
+AGAIN_S = 0.1  # after which a lost stop is raised again
 
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
-    """Let these signals call `handler` for a while, except those that are ignored on purpose (nohup)."""
+    """Let these signals call `handler` in this context, except deliberately ignored ones (nohup)."""
     before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
     for number in before:
         signal.signal(number, handler)
@@ -45,7 +45,7 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> 
 
 
 class _Wait:
-    """Whether a stop waits; the number of one that does; whether the last has arrived, and it while on its way."""
+    """State of a stop: whether stops wait, the waiting signal, whether the last stop arrived, and the raised stop."""
 
     asked = heard = False
     came = 0
@@ -53,14 +53,14 @@ class _Wait:
 
 
 class _Stop(KeyboardInterrupt):
-    """A stop on its way: it lives until somebody has handled it, or lost it."""
+    """A raised stop: it exists until it is handled or lost."""
 
     def __init__(self) -> None:
-        _Wait.stop = weakref.ref(self)  # here, where no frame of its traceback holds it
+        _Wait.stop = weakref.ref(self)  # here, where no frame of its traceback references it
 
 
 def heard() -> None:
-    """Note that a stop was handled: whoever handles one and goes on calls this, so that nothing stops it again."""
+    """Note that a stop was handled. Code that handles a stop and continues must call this."""
     _Wait.heard = True
 
 
@@ -71,8 +71,8 @@ def _arrives() -> bool:
 def _interrupt(number: int, stack: FrameType | None) -> None:
     """Raise a stop, again and again until it arrives.
 
-    A handler runs between two steps of any Python code, and whatever C code has called that may take what it raises
-    for an answer: NumPy asks operands for `__array_ufunc__`, an enum answers in Python, an error means no.
+    A handler runs between two steps of any Python code. If C code called that code, it may swallow the exception: NumPy
+    looks up `__array_ufunc__` of an operand, an enum runs Python for it, and NumPy treats an error as absence.
     """
     if _Wait.asked:
         _Wait.came = number
@@ -81,7 +81,7 @@ def _interrupt(number: int, stack: FrameType | None) -> None:
     def again(alarm: int, stack: FrameType | None) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0 if _Wait.heard else AGAIN_S)
         if not _arrives():
-            signal.raise_signal(number)  # whoever listens now may put it off
+            signal.raise_signal(number)  # the current handler may delay it
 
     signal.signal(signal.SIGALRM, again)
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
@@ -90,7 +90,7 @@ def _interrupt(number: int, stack: FrameType | None) -> None:
 
 @contextmanager
 def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Send the signals of a stop to `handler`; one that leaves this context has arrived."""
+    """Send the signals of a stop to `handler`; a stop that leaves this context has arrived."""
     before, _Wait.heard = signal.getsignal(signal.SIGALRM), False
     try:
         with handled(handler, *SIGNALS):
@@ -102,9 +102,9 @@ def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Inside, a stop waits: for calls that take a queue's lock, which a KeyboardInterrupt might leave taken for good.
+    """Delay stops in this context, for calls whose lock a KeyboardInterrupt could leave locked.
 
-    Whoever needs that lock next, if only to close the writer at the end, would wait for ever. Not to be nested.
+    The next user of that lock, e.g. the writer's close, would wait without limit. Do not nest.
     """
     _Wait.asked = True
     try:
@@ -125,7 +125,7 @@ def interrupts() -> Iterator[None]:
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """As `interrupts`, but only the first: others do not cut short the switching off of pumps, nor the summary."""
+    """Raise only the first: later ones do not interrupt the switching off of pumps or the summary."""
 
     def answer(number: int, stack: FrameType | None) -> None:
         if _arrives():
@@ -139,7 +139,7 @@ def one_interrupt() -> Iterator[None]:
 
 @contextmanager
 def unmasked() -> Iterator[None]:
-    """Turn an ImportError that a stop caused while an extension module was loaded back into a KeyboardInterrupt."""
+    """Turn an ImportError caused by a stop during the load of an extension module back into a KeyboardInterrupt."""
     try:
         yield
     except (ImportError, SystemError) as error:
@@ -152,7 +152,7 @@ def unmasked() -> Iterator[None]:
 
 
 class Pause:
-    """Signals that wait until the work can be saved, and then go to whoever listened for them before.
+    """Signals that wait until the work can be saved, and then go to their previous handler.
 
     Args: until: when it will look, for the user.
     """
@@ -163,27 +163,27 @@ class Pause:
         self._came: list[int] = []
 
     def __call__(self) -> bool:
-        """Whether a signal waits."""
+        """Return whether a signal waits."""
         return bool(self._came)
 
     def answer(self, number: int, stack: FrameType | None) -> None:
         """Handle a signal. A second one from the user ends the program at once; a cluster may repeat its own.
 
-        A worker hears it from the terminal and from its command, which then waits for it.
+        A worker gets it from the terminal and from its command, which then waits for the worker.
         """
         old = self._before[number]
         ours = number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
         if self._came and ours and multiprocessing.parent_process() is None:
-            print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
+            print("stopped at once; earlier saved data is complete", file=sys.stderr, flush=True)
             os._exit(STATUS)
         if not self._came:
-            print(f"stopping {self._until}; once more stops at once", flush=True)
+            print(f"stopping {self._until}; a second signal stops at once", flush=True)
         self._came.append(number)
 
     def pass_on(self) -> None:
-        """Give what came to whoever listened before: a batch system queues the job again, or lets it work on.
+        """Pass the signal to its previous handler: a batch system requeues the job, or lets it continue.
 
-        Raises: KeyboardInterrupt where nobody listened, or whatever the listener raises.
+        Raises: KeyboardInterrupt without a previous handler, or that handler's exception.
         """
         came, self._came = self._came, []
         for number in dict.fromkeys(came):
@@ -195,7 +195,7 @@ class Pause:
 
 @contextmanager
 def pausing(until: str) -> Iterator[Pause]:
-    """Inside, the first signal only makes the yielded pause true; a second one from the user ends the program at once.
+    """Let the first signal only set the yielded pause; a second one from the user ends the program at once.
 
     For work that can be saved between two of its steps only. Args: until: when it will look, for the user.
     """
@@ -205,7 +205,7 @@ def pausing(until: str) -> Iterator[Pause]:
 
 
 def _begin_worker() -> None:
-    """In a worker: what the command loaded; and it ends when its parent does, also when that was killed."""
+    """Prepare a worker: load the command's extensions; end with the parent, also if it is killed."""
     extensions.load_all()
     parent = multiprocessing.parent_process()
 
@@ -218,9 +218,9 @@ def _begin_worker() -> None:
 
 
 class Workers(ProcessPoolExecutor):
-    """Spawned worker processes that leave signals from the terminal to the command; left by an exception, they end.
+    """Spawned worker processes that leave terminal signals to the command; an exception in the context ends them.
 
-    Spawned, because a fork would copy torch's threads in whatever state they are.
+    They are spawned, because a fork copies torch's threads in an arbitrary state.
     Args: count: of processes; 0 for one per core.
     """
 
@@ -229,7 +229,7 @@ class Workers(ProcessPoolExecutor):
         super().__init__(count or os.cpu_count() or 1, mp_context=context, initializer=_begin_worker)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """As of an executor. A process started here inherits which signals are held back."""
+        """Submit as to an executor. A new process inherits the blocked signals."""
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
         try:
             return super().submit(fn, *args, **kwargs)

@@ -1,4 +1,4 @@
-"""A sweep: a folder named once, a record of every job in it, and going on with the jobs that are missing."""
+"""A sweep: its folder, a record of every job, and the continuation of missing jobs."""
 
 import fcntl
 import hashlib
@@ -24,27 +24,27 @@ RECORD, JOB = "sweep.json", "job.json"
 SEARCH = "hparams_search="
 FLAGS = ("-m", "--multirun")
 FOLDER = "hydra.sweep.dir="
-LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # what another start of a sweep may say differently
+LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # arguments that may differ between starts of a sweep
 
 
 class Busy(Exception):
-    """Another process works on this job; the message is one line."""
+    """Error: another process works on this job; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """folder: of the sweep. command: that swept. arguments: of it, without folder and flag, as they were typed."""
+    """A sweep. folder: of the sweep. command: its command. arguments: as typed, without folder and flag."""
 
     folder: Path
     command: str
     arguments: list[str]
 
     def line(self) -> list[str]:
-        """Return the command line with the folder spelled out, so that workers and later starts find it."""
-        return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse takes the flag only in front
+        """Return the command line with the folder, for workers and later starts."""
+        return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse accepts the flag only in front
 
     def save(self) -> None:
-        """Write down what was asked for. Raises: UserError where the folder holds a sweep of something else."""
+        """Save the sweep. Raises: UserError if the folder has another sweep."""
         before = read(self.folder)
         if before and (before.command, _lasting(before.arguments)) != (self.command, _lasting(self.arguments)):
             other = shlex.join([f"experiments.{before.command}", *before.line()])
@@ -53,22 +53,22 @@ class Sweep:
         files.write_json(self.folder / RECORD, {"command": self.command, "arguments": self.arguments})
 
     def again(self) -> str:
-        """Return the command that does what is missing."""
+        """Return the command that runs the missing jobs."""
         return f"python -m experiments.{self.command} -m resume={shlex.quote(str(self.folder))}"
 
 
 def _lasting(arguments: Sequence[str]) -> list[str]:
-    """Without what may differ between two starts of one sweep."""
+    """Return the arguments that must not differ between starts of a sweep."""
     return [a for a in arguments if not a.startswith(LATER)]
 
 
 def fresh(command: str) -> Path:
-    """Where a run of a command writes. The name holds the second and the process number: two runs never meet."""
+    """Return a new run folder. Its name has the second and the process number, so it is unique."""
     return Path("runs") / command / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"
 
 
 def read(folder: Path) -> Sweep | None:
-    """Read the sweep in a folder, None where there is none or its record is damaged."""
+    """Read the sweep in a folder, None without one or with a damaged record."""
     try:
         found = json.loads((folder / RECORD).read_text("utf-8"))
         return Sweep(folder, str(found["command"]), [str(a) for a in found["arguments"]])
@@ -77,10 +77,10 @@ def read(folder: Path) -> Sweep | None:
 
 
 def asked(given: Sequence[str], command: str) -> Sweep | None:
-    """Return the sweep that a command line asks for, None where it asks for a single run.
+    """Return the sweep of a command line, None for a single run.
 
-    `resume=SWEEP` is the sweep that was begun there, by whatever launcher it names now.
-    Raises: UserError where it names anything else beside.
+    `resume=SWEEP` is the sweep of that folder, with the launcher of this line.
+    Raises: UserError with other arguments beside it.
     """
     plain = [a for a in given if a not in FLAGS]
     folder = next((Path(a.removeprefix("resume=")) for a in reversed(plain) if a.startswith("resume=")), None)
@@ -93,11 +93,11 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
         kept = [a for a in before.arguments if a.partition("=")[0] not in keys]
-        if any(a.startswith("hydra/launcher=") for a in new):  # settings of the launcher before are not for this one
+        if any(a.startswith("hydra/launcher=") for a in new):  # without the settings of the previous launcher
             kept = [a for a in kept if not a.startswith("hydra.launcher.")]
         return Sweep(before.folder, command, kept + new)
     if folder and len(plain) < len(given):
-        raise UserError(f"resume={folder}: no sweep; a single run goes on without -m")
+        raise UserError(f"resume={folder}: no sweep; continue a single run without -m")
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
@@ -106,14 +106,14 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
 
 
 def searches(arguments: Sequence[str]) -> bool:
-    """Whether the jobs of a sweep follow from each other's results."""
+    """Return whether the jobs of a sweep depend on each other's results."""
     return any(a.lstrip("+").startswith(SEARCH) and not a.endswith("=null") for a in arguments)
 
 
 def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
-    """List the overrides of every job, in order; None for a search, whose jobs follow from each other.
+    """List the overrides of every job, in order; None for a search, whose jobs depend on results.
 
-    Args: arguments: in the form that Hydra takes. Raises: hydra.errors.HydraException for what is none.
+    Args: arguments: in Hydra's form. Raises: hydra.errors.HydraException for other text.
     """
     if searches(arguments):
         return None
@@ -129,10 +129,10 @@ def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
 
 @dataclass
 class Job:
-    """What job.json says of a job.
+    """Content of a job's job.json.
 
     state: running (or stopped, if no process works on it), finished, failed. config: hash of its config.
-    objective: what it returned. error: why it failed, one line.
+    objective: its return value. error: reason of a failure, one line.
     """
 
     folder: Path
@@ -144,7 +144,7 @@ class Job:
 
     @classmethod
     def at(cls, folder: Path) -> "Job":
-        """Return the job of a folder, whatever there is of it."""
+        """Return the job of a folder, also an incomplete one."""
         try:
             found = json.loads((folder / JOB).read_text("utf-8"))
             return cls(folder, found["state"], found["config"], found["objective"], found["error"])
@@ -152,13 +152,13 @@ class Job:
             return cls(folder)
 
     def save(self, state: str, objective: float | None = None, error: str = "") -> None:
-        """Write down where the job stands."""
+        """Save the state of the job."""
         self.state, self.objective, self.error = state, objective, error
         kept = {"state": state, "config": self.config, "objective": objective, "error": error}
         files.write_json(self.folder / JOB, kept)
 
     def begin(self, config: Any) -> None:
-        """Begin the job with this config. Raises: UserError where its folder holds a run of another config."""
+        """Begin the job with this config. Raises: UserError if its folder has a run of another config."""
         digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
         if self.config not in ("", digest):
             raise UserError(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
@@ -167,7 +167,7 @@ class Job:
             self.save("running")
 
     def put_aside(self) -> None:
-        """Move files of an earlier start that nobody can continue to stopped_1, stopped_2, ..."""
+        """Move files of an earlier start that cannot be continued to stopped_1, stopped_2, ..."""
         own = (JOB, ".hydra", ".lock")
         left = [p for p in self.folder.iterdir() if p.name not in own and p.suffix != ".log"]
         left = [p for p in left if not p.name.startswith("stopped_")]
@@ -181,9 +181,9 @@ class Job:
 
 @contextmanager
 def working(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Inside, no other process works on the job of a folder.
+    """Exclude other processes from the job of a folder in this context.
 
-    Args: wait: for one that does already. Raises: Busy where one does and nobody waits.
+    Args: wait: for another process. Raises: Busy without waiting.
     """
     with open(folder / ".lock", "w") as lock:
         try:
@@ -194,39 +194,39 @@ def working(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def _free(folder: Path) -> bool:
-    """Whether no process works on a job."""
+    """Return whether no process works on a job."""
     try:
         with working(folder):
             return True
     except Busy:
         return False
-    except OSError:  # a folder of somebody else's: nothing of ours runs there
+    except OSError:  # another user's folder: no process of this user works there
         return True
 
 
 def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
-    """Every job of a sweep as it stands, in order of its number.
+    """List every job of a sweep with its state, in order of number.
 
-    Args: expected: overrides of every job there should be; None: those that have a folder.
+    Args: expected: overrides of all jobs; None: the jobs with a folder.
     """
     there = sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
     found = (
         [Job.at(folder / str(k)) for k in range(len(expected))] if expected is not None else list(map(Job.at, there))
     )
     for k, job in enumerate(found):
-        if job.state == "running" and _free(job.folder):  # a process that was killed leaves that behind
+        if job.state == "running" and _free(job.folder):  # left by a killed process
             job.state = "stopped"
         job.overrides = [a.lstrip("+") for a in (expected[k] if expected is not None else files.given(job.folder))]
     return found
 
 
 def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
-    """How many jobs of a sweep came to their end, and what to do about the others, one line."""
+    """Describe how many jobs of a sweep finished, and the remedy for the others, in one line."""
     found = survey(sweep.folder, expected)
     done = sum(job.state == "finished" for job in found)
     line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
     if any(job.state == "running" for job in found):
-        line += f"; {sum(job.state == 'running' for job in found)} still at work in other processes"
+        line += f"; {sum(job.state == 'running' for job in found)} still running in other processes"
     over = ("finished", "running") if expected is not None else ("finished", "running", "failed")
     if all(job.state in over for job in found):
         return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"
@@ -234,7 +234,7 @@ def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
 
 
 def errors(folder: Path, expected: list[list[str]] | None, most: int = 3) -> str:
-    """Why jobs failed, and which, at the head of a line; empty where none did."""
+    """Describe which jobs failed and why, for the start of a line; empty without failures."""
     why: dict[str, list[str]] = {}
     for job in survey(folder, expected):
         if job.state == "failed":

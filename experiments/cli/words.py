@@ -1,4 +1,4 @@
-"""The words of a command line in the form that Hydra takes, and the line about those that nobody can take."""
+"""Arguments of a command line in Hydra's form, and the error message for invalid ones."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -17,12 +17,12 @@ EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 
 
 class UserError(Message, Exception):
-    """Something the user can mend; the message is one line and is all that is shown."""
+    """Error that the user can correct; only its message, one line, is shown."""
 
 
 @contextmanager
 def refusing(*errors: type[Exception], about: str = "") -> Iterator[None]:
-    """Inside, these errors are raised as a UserError. Args: about: stands before their message."""
+    """Raise these errors as a UserError in this context. Args: about: prefix of their message."""
     try:
         yield
     except errors as error:
@@ -30,7 +30,7 @@ def refusing(*errors: type[Exception], about: str = "") -> Iterator[None]:
 
 
 def _choose(command: str, group: str, option: str) -> None:
-    """Check that a command takes `group=option`. Raises: UserError naming what it takes, or the right command."""
+    """Check that a command accepts `group=option`. Raises: UserError with the accepted options or the right command."""
     given, own = f"{group}={option}", presets.chosen(command)
     known = presets.groups()[group]
     of = presets.owners(f"{group}/{option}") if option in known else ()
@@ -47,14 +47,12 @@ def _choose(command: str, group: str, option: str) -> None:
 
 
 def normalise(argv: Sequence[str], command: str) -> list[str]:
-    """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
+    """Convert arguments to Hydra's form, independent of the YAML files.
 
-    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own; with a
-    task comes the agent that belongs to it, unless another is chosen. Every
-    other key is forced in, because a default stands in the dataclass and not in YAML, and an unknown key is named by
-    the schema. `resume=RUN` makes RUN the run folder; `extend=FILE.py` has been obeyed when this returns.
-    Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
-      that cannot be used.
+    `group=option` or `+group=option` selects a preset or a user's YAML file. A task selects its agent, unless another
+    is given. Every other key is forced in, because defaults are in the dataclass and not in YAML; the schema refuses an
+    unknown key. `resume=RUN` makes RUN the run folder; `extend=FILE.py` is loaded on return. Raises: UserError for an
+    unknown group or option, with the accepted ones, and for an unusable file.
     """
     with refusing(ValueError):
         _without_key(argv, command)
@@ -101,7 +99,7 @@ def _without_key(argv: Sequence[str], command: str) -> None:
 
 
 def _with_preset_files(arg: str) -> str:
-    """`group=FILE.yaml` as `group=FILE`, a preset from here on; so is each of several that a sweep goes over."""
+    """Register `group=FILE.yaml` as a preset and return `group=FILE`, also for each file of a sweep."""
     match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml\b.*)$", arg)
     if match is None or match[2] not in presets.groups():
         return arg
@@ -109,7 +107,7 @@ def _with_preset_files(arg: str) -> str:
 
 
 def _engine(group: str, option: str) -> str:
-    """Check that a launcher of Hydra's is installed. Raises: UserError with the remedy for one that is not."""
+    """Check that a Hydra launcher is installed. Raises: UserError with the remedy otherwise."""
     needs = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit", "slurm": "submitit"}
     if group == "hydra/launcher":
         if option not in ("basic", *needs):

@@ -1,4 +1,4 @@
-"""Pictures of two species: their curves, a run that controlled their composition, and episodes of a training."""
+"""Figures of two species: curves, a run with a composition, and episodes of a training."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -30,7 +30,7 @@ def episodes(
     best_temperature: Array,
     species: str,
 ) -> Figure:
-    """Noise-free episodes, a column each: share with setpoint and optimum, temperatures chosen.
+    """Draw noise-free episodes, a column each: share with setpoint and optimum, chosen temperatures.
 
     Args: hours: (K,). wanted, learned, best: shares, (K, G). temperature, best_temperature: targets, degC, (K, G).
       species: whose share it is.
@@ -64,9 +64,9 @@ def composition_figure(
     Args:
       columns: of the recordings, (N, K) each, nan where a reactor has no sample: time_min, ratio, ratio_low,
         ratio_high, ratio_setpoint, temperature_degc, temperature_target_degc, od, setpoint, pump_rate_ml_s,
-        fluorescence; true_ratio where it is known. names: N labels. species: whose share it is.
-      announced: of each reactor, minutes at which a change was made known, and to which share. counted: minutes, shares
-        that somebody counted in a sample, and their sds.
+        fluorescence; true_ratio if known. names: N labels. species: whose share it is.
+      announced: of each reactor, minutes and values of announced changes. counted: minutes, counted shares of samples,
+      and their sds.
     """
     figure, axes = new_figure(8.0, 9.0, 5, 1, sharex=True, height_ratios=[2.4, 1.2, 1.0, 0.8, 1.0])
     share, heat, density, pump, light = axes
@@ -122,7 +122,7 @@ def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], spec
 
 
 def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure:
-    """Both curves with what was recorded and its 95 % intervals, where they cross, and production of pigment."""
+    """Draw both curves with the recorded rates and 95 % intervals, their crossing, and the production of pigment."""
     figure, (growth, pigment) = new_figure(7.5, 6.0, 2, 1, sharex=True, height_ratios=[2.0, 1.0])
     t = np.linspace(*pair.temperatures, 141)
     for k, (species, mine) in enumerate(zip((pair.first, pair.second), points, strict=True)):

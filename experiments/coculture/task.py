@@ -77,7 +77,7 @@ class Coculture:
         low, high = self.config.setpoints
         return ProgramRelabel(
             agent,
-            SPAN,
+            lambda uniform: SPAN * (2.0 * uniform - 1.0),
             lambda uniform: torch.logit(low + (high - low) * uniform),
             lambda x, setpoint: -torch.square(torch.sigmoid(x) - torch.sigmoid(setpoint)),
             SETPOINT,

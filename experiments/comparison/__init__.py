@@ -1,3 +1,3 @@
-"""Controllers side by side on simulated plants: trials, statistics, the paper's numbers, figures and page.
+"""Comparison of controllers on simulated plants: trials, statistics, the paper's numbers, figures and page.
 
-Entered by benchmark and report."""
+Benchmark and report import it."""

@@ -1,4 +1,4 @@
-"""What `python -m experiments.benchmark` can be told."""
+"""Config of `python -m experiments.benchmark`."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ TWIN = "twin"  # the plant of a plant_file
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """Every controller on every plant in every scenario; the names are keys of the config's groups."""
+    """A study: every controller on every plant in every scenario; names are keys of the config's groups."""
 
     scenarios: tuple[str, ...] = setting(("setpoint_steps",), "names of scenarios")
     plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
@@ -26,7 +26,7 @@ class StudyConfig:
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """The closed loops to compare. Raises: ValueError naming key, value and what is allowed."""
+    """The closed loops to compare. Raises: ValueError with key, value and allowed values."""
 
     replicates: int = setting(
         3, "vials per controller, plant and scenario (paper: 3), run as one batch", within=(1, 10_000)
@@ -83,7 +83,7 @@ SETTLING_MIN = 10.0
 
 
 class Published(NamedTuple):
-    """One cell pair of what the paper reports (Brancato et al., L4DC 2024, Table 2): real reactors, three replicates.
+    """One pair of cells of the paper's table (Brancato et al., L4DC 2024, Table 2): real reactors, three replicates.
 
     window: setpoint or temperature. ise, itae: T read as 1 min.
     """

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK_MIN = 10.0
-LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
-NOISELESS = 1e-5  # scores below are those of a plant without noise
+LEAST = 1e-9  # end of an interval that reaches zero on a logarithmic axis
+NOISELESS = 1e-5  # lower scores are those of a plant without noise
 
 MARKS = {
     "dqn": (COLOURS[0], "o"),
@@ -42,19 +42,19 @@ MARKS = {
 
 
 def _mark(controller: str) -> tuple[str, str]:
-    """Colour and marker."""
+    """Return colour and marker of a controller."""
     return MARKS.get(controller, (COLOURS[0], "X"))
 
 
 def _handles(controllers: Sequence[str]) -> list[Line2D]:
-    """Their entries of a legend."""
+    """Return the entries of a legend."""
     return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
 
 
 def estimate(
     ax: Axes, mark: tuple[str, str], y: float, value: float, interval: Sequence[float], hollow: bool = False
 ) -> None:
-    """Draw a law's mark with its 95 % interval, where it has one."""
+    """Draw a controller's mark with its 95 % interval, if any."""
     colour, marker = mark
     if np.isfinite(interval[0]):
         ax.plot(interval, [y, y], color=colour, linewidth=1.3)
@@ -62,7 +62,7 @@ def estimate(
 
 
 def _band(ax: Axes, time: Array, values: Array, colour: str) -> None:
-    """Mean over replicates and one standard deviation around it; values (N, K)."""
+    """Draw the mean over replicates and one standard deviation around it; values (N, K)."""
     mean = values.mean(axis=0)
     if values.shape[0] > 1:
         sd = values.std(axis=0, ddof=1)
@@ -86,7 +86,7 @@ def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
 
 
 def bands(trials: Sequence[DensityTrial]) -> Figure:
-    """OD over pump rate (over temperature), a column per controller: mean over replicates, band = one sd."""
+    """Draw OD above pump rate (above temperature), a column per controller: mean over replicates, band = one sd."""
     first = trials[0]
     switched = len(set(first.schedule.temperatures)) > 1
     rows, ratios = (3, [2.2, 1.1, 0.9]) if switched else (2, [2.2, 1.1])
@@ -120,7 +120,7 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
 
 
 def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the cells of the paper's Table 2 (hollow) beside ours (filled, bar = 95 % interval of the mean)."""
+    """Draw the cells of the paper's Table 2 (hollow) beside this run's (filled, bar = 95 % interval of the mean)."""
     cells = list(dict.fromkeys((p.scenario, p.window) for p in TABLE_2))
     names = [f"{w} °C" if s == "temperature_switch" else f"OD {w}" for s, w in cells]
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
@@ -151,9 +151,9 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
 def by_plant(
     entries: Sequence[Mapping[str, Any]], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
 ) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
-    """Empty panels, one per metric, with a striped row per plant; returns also the height of an entry.
+    """Create empty panels, one per metric, with a striped row per plant; return also the height of an entry.
 
-    Args: entries: of all plants and laws that will be drawn. handles: of the legend.
+    Args: entries: of all drawn plants and controllers. handles: of the legend.
     """
     names = list(dict.fromkeys(str(e["plant"]) for e in entries))
     controllers = list(dict.fromkeys(law_of(e) for e in entries))
@@ -187,12 +187,12 @@ def _log_axis(ax: Axes) -> None:
 
 
 def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of every controller but `hold`.
+    """Draw ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of all but `hold`.
 
     Args: entries: of `statistics.totals`, all of one scenario.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
-    # Whose floor is drawn: all controllers met the same sensors, so their floors nearly agree.
+    # One floor is drawn: all controllers met the same sensors, so their floors nearly agree.
     witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
     figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), floor_line])
@@ -212,7 +212,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
-    """Paired difference of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval per plant.
+    """Draw paired differences of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval.
 
     Args: entries: of `statistics.total_pairs`, all of one scenario; against: the controller at zero.
     """

@@ -31,14 +31,14 @@ DENSITY = {
     "settling time": "minutes after which |e| stays within 5 % of the setpoint to the end of the window; median over "
     "replicates, a dash where half or more never settle. The paper does not define its band.",
     "steady error": "mean |e| over the last 10 min of a window.",
-    "sensor-noise floor": "the score of the sensor's own error, reading minus what it would show without noise: what a "
-    "culture exactly on the setpoint would be given.",
+    "sensor-noise floor": "the score of the sensor's error alone (reading minus noise-free reading), i.e. of a "
+    "culture exactly on the setpoint.",
     "oracle": "dynamic programming on each vial's own growth rate, pump and volume, seeing the OD without noise and "
     "not knowing setpoints ahead. On the plant nominal nothing that starts a window from the same OD has a lower ISE; "
     "elsewhere it shows what full knowledge of the present is worth.",
-    "noise-free": "the same metrics on the OD that a sensor without noise would have shown.",
-    "interlock": "stands between every controller and the pumps, with the limits of a bench; a reading it does not "
-    "believe gets no dose, whoever proposed one.",
+    "noise-free": "the same metrics on the noise-free OD.",
+    "interlock": "stands between every controller and the pumps, with the limits of a bench; a rejected "
+    "reading gets no dose from any controller.",
     "control effort": "mean change of the pump rate from one decision to the next, µL/s.",
     "paired difference": "controller minus the other, replicate by replicate: both meet the same vials, pumps, sensors "
     "and noise. 95 % interval: Student's t of the mean over replicates, without correction for the number of "
@@ -46,10 +46,10 @@ DENSITY = {
     "±": "one standard deviation over replicates.",
 }
 ESTIMATES = (
-    ("error_2sd_pct", "Decisions in which e lay within two of its own sd of the truth, %"),
-    ("share_2sd_pct", "Decisions in which s lay within two of its own sd of the share that holds at rest, %"),
-    ("supervised_pct", "Decisions by the supervisor's law, %"),
-    ("alarm_pct", "Decisions by it because of surprises, %"),
+    ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
+    ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
+    ("supervised_pct", "Decisions by the supervisor's controller, %"),
+    ("alarm_pct", "Of these, because of innovations, %"),
 )
 RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
 """Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
@@ -57,12 +57,12 @@ OUT_OF_COMPETITION = ("oracle", "optimum")
 
 
 def law_of(entry: Row) -> str:
-    """Name the law of an entry as a reader knows it."""
+    """Return the displayed name of an entry's controller."""
     return f"{entry['controller']}, told ahead" if entry.get("preview") else str(entry["controller"])
 
 
 def name_of(scenario: str, window: str) -> str:
-    """Name a window as a reader knows it."""
+    """Return the displayed name of a window."""
     return f"{window} °C" if scenario == "temperature_switch" else window if "h" in window else f"OD {window}"
 
 
@@ -83,7 +83,7 @@ def _mark(text: str, best: bool) -> str:
 
 
 def beside(summary: Row) -> list[Row]:
-    """List the rows that stand beside the paper's table."""
+    """List the rows beside the paper's table."""
     keys = ("controller", "plant", "scenario", "window")
     chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
     return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
@@ -92,8 +92,8 @@ def beside(summary: Row) -> list[Row]:
 def table_2(rows: Sequence[Row], metric: str) -> Table:
     """Build the paper's table for one metric beside this run's.
 
-    The lowest of the paper's three controllers is marked and named on each side. Controllers that
-    the paper does not have follow in columns of their own, without a rank.
+    The lowest of the paper's three controllers is marked and named on each side. Controllers outside the paper follow
+    in further columns, without a rank.
     """
     body: list[tuple[str, ...]] = []
     others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
@@ -124,7 +124,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
 
 
 def cell_by_cell(rows: Sequence[Row]) -> Table:
-    """Compare published and ours for each controller, in both conventions, and say which is lower."""
+    """Compare the published value and this run's for each controller, in both conventions, and name the lower one."""
     body = []
     for p in TABLE_2:
         row = _find(rows, controller=p.controller, scenario=p.scenario, window=p.window)
@@ -148,7 +148,7 @@ def cell_by_cell(rows: Sequence[Row]) -> Table:
 
 
 class Loss(NamedTuple):
-    """A published controller that is lower than the learned policy in one cell of the table, as a sentence."""
+    """Sentence about a published controller that is lower than the learned policy in a cell of the table."""
 
     cell: str
     certain: bool  # the 95 % interval of the paired difference excludes 0
@@ -156,7 +156,7 @@ class Loss(NamedTuple):
 
 
 def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> list[Loss]:
-    """Every published controller that is lower than the learned policy, cell by cell, the lowest first."""
+    """List published controllers that are lower than the learned policy, cell by cell, the lowest first."""
     found = []
     for scenario, window in _windows(rows):
         for metric in METRICS:
@@ -183,7 +183,7 @@ def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> 
 
 
 def published_losses() -> list[str]:
-    """List the cells of the published table that its DQN loses."""
+    """List the cells of the published table in which another controller beats its DQN."""
     found = []
     for metric in METRICS:
         for scenario, window in dict.fromkeys((p.scenario, p.window) for p in TABLE_2):
@@ -205,9 +205,9 @@ def matrix(
     floor: Callable[[Row], str] | None = None,
     laws_down: bool = False,
 ) -> Table:
-    """Plants down, laws across, or the other way round; each plant's lowest `ranked_by` is marked, but not the oracle.
+    """Tabulate plants and controllers; mark each plant's lowest `ranked_by`, without the oracle.
 
-    Args: text: of a cell. floor: of the last column, the sensor's noise alone, from any controller's entry.
+    Args: text: of a cell. floor: last column, score of the sensor's noise alone, from any controller's entry.
     """
     laws = list(dict.fromkeys(map(law_of, entries)))
     body = []
@@ -296,7 +296,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
 
 
 def estimates(out: Page, summary: Row, scenario: str) -> None:
-    """How sure laws that estimate were, and how often they were right, on every plant of a scenario."""
+    """Tabulate the uncertainty and coverage of controllers with an estimator on every plant of a scenario."""
     totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
     for key, title in ESTIMATES if totals else ():
         note = f"{scenario}; mean, n = {totals[0]['n']}."
@@ -304,7 +304,7 @@ def estimates(out: Page, summary: Row, scenario: str) -> None:
 
 
 def all_rows(summary: Row) -> Table:
-    """Every row of summary.json beside its details."""
+    """Tabulate every row of summary.json with its details."""
     body = []
     for row, more in zip(summary["rows"], summary["details"], strict=True):
         body.append(
@@ -336,7 +336,7 @@ def _interval(ci: Sequence[float | None]) -> str:
 
 
 def _in_short(out: Page, summary: Row) -> None:
-    """Summarise: the learned policy beside the paper's, and the lowest of every scenario and plant."""
+    """Summarise: the learned policy and the paper's, and the lowest of every scenario and plant."""
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
     for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] != "density")):
         key, _ = RANKED[str(entry["signal"])]
@@ -362,7 +362,7 @@ def _runs(entry: Row) -> bool:
 
 
 def _alone(summary: Row, entry: Row) -> str:
-    """Describe a law that met no other one: its score, beside the oracle where that was run, and the sensor's noise."""
+    """Describe a single controller: its score, the oracle's if it was run, and the sensor's noise."""
     oracle = _find(summary["totals"], controller="oracle", plant=entry["plant"], scenario=entry["scenario"])
     scores = []
     for metric in METRICS:
@@ -373,7 +373,7 @@ def _alone(summary: Row, entry: Row) -> str:
 
 
 def _first(laws: Mapping[str, Sequence[float]]) -> str:
-    """Name the lowest of laws and the next one, by the mean of their values."""
+    """Name the lowest controller and the next one, by the mean of their values."""
     means = {law: sum(values) / len(values) for law, values in laws.items()}
     (law, value), (other, beyond), *_ = sorted(means.items(), key=lambda item: item[1])
     return f"{law} {number(value)}, then {other} {number(beyond)}"
@@ -409,7 +409,7 @@ def _paper_section(out: Page, summary: Row) -> None:
 
 
 def _below_bound(summary: Row) -> str:
-    """Name published ISE that no controller can reach on the training model, where the oracle was run on it."""
+    """Name published ISE below the oracle's on the training model, if the oracle was run on it."""
     found = []
     for p in TABLE_2:
         if p.scenario != "setpoint_steps":
@@ -428,7 +428,7 @@ def _below_bound(summary: Row) -> str:
 
 
 def _settings(agents: Mapping[str, Row]) -> Table | None:
-    """Tabulate the hyper-parameters in which the agents trained here differ."""
+    """Tabulate the hyper-parameters that differ between the agents of this run."""
     trained = {name: entry["agent"] for name, entry in agents.items() if "agent" in entry}
     if len(trained) < 2:
         return None
@@ -486,8 +486,8 @@ def _density(out: Page, summary: Row, run: Path) -> None:
     if wide:
         out.section("Every plant")
         out.text(
-            "Model-based controllers and the learned policy believe the model of the configuration (env) "
-            "whatever the plant is; what each plant is stands in the configuration below."
+            "Model-based controllers and the learned policy use the model of the configuration (env) "
+            "on every plant; the configuration below describes each plant."
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
@@ -499,7 +499,7 @@ def _density(out: Page, summary: Row, run: Path) -> None:
 
 
 class Section(NamedTuple):
-    """What a page has of a signal: its title, what adds the sections, and the words that these use."""
+    """Part of the page for a signal: title, function that adds the sections, and their terms."""
 
     title: str
     add: Callable[[Page, Row, Path], None]

@@ -38,7 +38,7 @@ FOLLOWED: dict[str, Callable[[BenchmarkConfig, Iterable[str], Path], Mapping[str
 def learned(
     config: BenchmarkConfig, wanted: set[str], folder: Path
 ) -> tuple[dict[str, Followed], dict[str, Any], list[dict[str, str]]]:
-    """Policies of the learned controllers, where each comes from, and the figures of those trained here."""
+    """Return the policies of the learned controllers, their origins, and the figures of those trained here."""
     found: dict[str, Followed] = {}
     agents: dict[str, Any] = {}
     figures = []
@@ -51,7 +51,7 @@ def learned(
             found[name] = policy, certificate.bounds(policy, own, find_policy(where), config.env)
             agents[name] = {"policy": where, "regret_pct": policy.metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
-        from experiments.training.run import train  # torch, only where agents are trained
+        from experiments.training.run import train  # torch, only for training
 
         log.info("training %s: %d seeds", name, config.train_seeds)
         run = folder / "training" / name
@@ -76,7 +76,7 @@ def learned(
 
 
 def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
-    """Every trajectory, as `scenario/plant/controller/od` etc. of shape (N, K), in trajectories.npz."""
+    """Write every trajectory as `scenario/plant/controller/od` etc., shape (N, K), to trajectories.npz."""
     arrays = {
         f"{t.cell.scenario}/{t.cell.plant}/{t.cell.controller}/{key}": getattr(t, key).astype(np.float32)
         for t in trials
@@ -86,7 +86,7 @@ def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
 
 
 def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
-    """With the plant of `plant_file`: its vials begin anywhere in the recording, at the OD of all other plants.
+    """Add the plant of `plant_file`; its vials start anywhere in the recording, at the OD of all other plants.
 
     Raises: frame.UserError.
     """
@@ -99,7 +99,7 @@ def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
-    """With a controller of its own for each seed where `policies` names several. Raises: frame.UserError."""
+    """Add a controller per seed if `policies` has several. Raises: frame.UserError."""
     for name, where in config.policies.items():
         if name not in config.controllers or config.controllers[name].kind != "dqn":
             known = [n for n, c in config.controllers.items() if c.kind == "dqn"]
@@ -147,7 +147,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
             own = [cell for cell in wanted if cell.signal == signal]
             for name, followed in policies_of(config, sorted({cell.controller for cell in own}), folder).items():
                 loops.start([cell for cell in own if cell.controller == name], followed)
-        loops.start([cell for cell in density if cell.controller not in names])  # they run while agents are trained
+        loops.start([cell for cell in density if cell.controller not in names])  # they run during the training
         found, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
         shown += learning
         for name in sorted(names):

@@ -1,4 +1,4 @@
-"""From trials to numbers: means with intervals, and paired differences between laws that met the same draws."""
+"""Statistics of trials: means with intervals, and paired differences between controllers on the same draws."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -20,11 +20,11 @@ METRICS = ("ise", "itae")
 TOLD = {
     "supervised_pct": "supervised", "alarm_pct": "alarm", "error_2sd_pct": "error", "share_2sd_pct": "growth_share",
 }  # fmt: skip
-NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
+NEGLIGIBLE = 1e-6  # smallest mean for a difference in percent
 
 
 class Spread:
-    """Mean, median and standard deviation over replicates, 95 % intervals of mean (Student's) and median; nan left out.
+    """Mean, median and standard deviation over replicates, 95 % intervals of mean (Student's) and median, without nan.
 
     With one replicate there is no deviation and no interval (nan).
     """
@@ -36,7 +36,7 @@ class Spread:
         self.mean = float(finite.mean()) if self.n else float("nan")
         self.median = float(np.median(finite)) if self.n else float("nan")
         self.sd = float(finite.std(ddof=1)) if self.n > 1 else float("nan")
-        # of the median whatever the distribution: order statistics, by the binomial of a sign test
+        # of the median of any distribution: order statistics, by the binomial of a sign test
         ordered, below = np.sort(finite), int(binom.ppf(0.025, self.n, 0.5)) if self.n else 0
         self.median_ci95 = [float(ordered[below - 1]), float(ordered[-below])] if below else [float("nan")] * 2
         half = float(student.ppf(0.975, self.n - 1)) * self.sd / self.n**0.5 if self.n > 1 else float("nan")
@@ -44,13 +44,13 @@ class Spread:
 
     @property
     def sign(self) -> int:
-        """-1 or 1 where the interval excludes zero, else 0. Without any spread the sign of the mean counts."""
+        """-1 or 1 if the interval excludes zero, else 0. Without any spread the sign of the mean."""
         low, high = self.ci95
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
 
 
 def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
-    """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
+    """Build one row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
     settled = float(np.median(np.nan_to_num(score.settling_min, nan=np.inf)))  # "never" is infinity
@@ -84,7 +84,7 @@ ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
 
 
 def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
-    """List what `rows` leaves out, an entry per row: the other convention, the noise-free OD, the floor, the effort."""
+    """List further values, an entry per row: the other convention, the noise-free OD, the floor, the effort."""
     found = []
     for trial in trials:
         for window in windows(trial.schedule):
@@ -110,13 +110,13 @@ def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
 
 
 def _total(trial: DensityTrial, metric: str, of: str = "measured") -> Array:
-    """Sum of a metric over the windows of a trial, (N,)."""
+    """Sum a metric over the windows of a trial, (N,)."""
     each = [getattr(trial.score(window, of), metric) for window in windows(trial.schedule)]
     return np.asarray(np.sum(each, axis=0))
 
 
 def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
-    """One entry per trial: ISE and ITAE summed over its windows, and what it cost in medium and pump moves."""
+    """Build one entry per trial: ISE and ITAE summed over its windows, medium and pump moves."""
     found = []
     for trial in trials:
         entry = trial.names() | {"n": int(trial.od.shape[0])}
@@ -155,7 +155,7 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
 
 
 def _partners(trials: Sequence[T], against: str) -> list[tuple[T, T]]:
-    """Every trial with that of `against` on the same vials."""
+    """Return every trial with the trial of `against` on the same vials."""
     of = {t.cell.vials: t for t in trials if t.cell.controller == against}
     return [(t, of[t.cell.vials]) for t in trials if t.cell.controller != against and t.cell.vials in of]
 
@@ -176,9 +176,9 @@ SCORES: dict[str, Callable[[Any], Scored]] = {
 
 
 def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
-    """Compare every law with `against` on the same vials, window by window.
+    """Compare every controller with `against` on the same vials, window by window.
 
-    Returns: mean difference over replicates with its 95 % interval, and in how many replicates it is lower.
+    Returns: mean difference over replicates with its 95 % interval, and the number of replicates in which it is lower.
     """
     found = []
     for one, other in _partners(trials, against):
@@ -189,7 +189,7 @@ def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
 
 
 def total_pairs(trials: Sequence[DensityTrial], against: str) -> list[dict[str, Any]]:
-    """As `pairs`, of the sums over windows."""
+    """Compare as `pairs`, for the sums over windows."""
     return [
         _pair(one, other, metric, "all", _total(one, metric), _total(other, metric))
         for one, other in _partners(trials, against)

@@ -1,4 +1,4 @@
-"""What a benchmark draws and counts: its closed loops, the calibration, the figures of its studies, summary.json."""
+"""Studies of a benchmark: calibration, figures of the closed loops, summary.json."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ DRAWN: dict[str, Callable[[Sequence[Any], Sequence[dict[str, Any]]], Iterator["D
 
 
 class Drawing(NamedTuple):
-    """A figure, the name of its file, and what stands above and below it on the page."""
+    """A figure, the name of its file, and its title and caption on the page."""
 
     name: str
     figure: Figure
@@ -40,7 +40,7 @@ class Drawing(NamedTuple):
 def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
     """Run the open-loop protocol on the training model with 1 % noise, and fit it.
 
-    Raises: ValueError where the recording cannot be fitted.
+    Raises: ValueError if the fit fails.
     """
     protocol = OpenLoop(mu=config.env.mu, tau=config.env.tau, control_min=config.env.control_min, seed=config.seed)
     time, od, rate = open_loop(protocol, np.random.default_rng(config.seed))
@@ -102,7 +102,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
 
 
 def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> Iterator[Drawing]:
-    """OD and pump rate of every study that is the paper's, or holds a single scenario and plant."""
+    """Draw OD and pump rate of the paper's studies and of studies with a single scenario and plant."""
     by_cell = {(t.cell.controller, t.cell.plant, t.cell.scenario): t for t in trials}
     for name, study in config.studies.items():
         several = len(study.plants) * len(study.scenarios) > 1
@@ -125,7 +125,7 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
 
 
 def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[dict[str, Any]]:
-    """List the rows beside the paper's table: first plant of the studies named like its scenarios."""
+    """List the rows beside the paper's table: first plant of the studies with the scenarios' names."""
     shown = []
     for name in ("setpoint_steps", "temperature_switch"):
         if name in config.studies and config.studies[name].plants:
@@ -139,7 +139,7 @@ def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[d
 
 
 def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
-    """All numbers of the closed loops, and the paper's."""
+    """Build all numbers of the closed loops, and the paper's."""
     plants, controllers = list(config.plants), list(config.controllers)
     density = [t for t in trials if isinstance(t, DensityTrial)]
     ordered = sorted(density, key=lambda t: (plants.index(t.cell.plant), controllers.index(t.cell.controller)))

@@ -1,4 +1,4 @@
-"""Closed loops to compare: one is a law on a plant in a scenario, all replicates as a single batch.
+"""Closed loops to compare: a controller on a plant in a scenario, all replicates as a single batch.
 
 A loop has a signal: what the law holds on its setpoint, the `density` by the pump or what a guest brings. `Loops` runs
 those that the studies of a benchmark need, in processes of their own.
@@ -48,12 +48,12 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 SUPERVISED = ("supervised", "alarm")
-LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
+LEAST_NOISE = 1e-9  # OD, of a sensor without noise
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is run once: names of the law that is compared, plant and scenario, and of the signal that it holds."""
+    """One closed loop: names of controller, plant, scenario and controlled signal."""
 
     controller: str
     plant: str
@@ -68,7 +68,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What N replicates did, sample by sample since the schedule began; minute (K,), temperature of the vial (N, K)."""
+    """Recording of N replicates since the start of the schedule; minute (K,), temperature of the vial (N, K)."""
 
     cell: Cell
     schedule: Scenario
@@ -82,7 +82,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Window:
-    """A phase of a schedule, named by what tells it from the others: setpoint, temperature (degC) or hours."""
+    """A phase of a schedule, named by its setpoint, temperature (degC) or hours, whichever differs."""
 
     label: str
     setpoint: float
@@ -105,13 +105,13 @@ def windows(schedule: Scenario) -> list[Window]:
 
 @dataclass(frozen=True, eq=False)
 class DensityTrial(Trial):
-    """A density that was held; arrays (N, K).
+    """Trial of a density; arrays (N, K).
 
-    od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the interlock.
+    od: as measured. clean: reading of a noise-free sensor. rate: mL/s after the interlock.
     media_ml: fresh medium delivered since the culture began.
     held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
-    told: of a law that estimates, shares of its decisions, (N,) each: in which its supervisor decided, in which it was
-    alarmed by surprises, and in which an estimate lay within two of its sd of the truth, by the estimate's name.
+    told: for a controller with an estimator, fractions of its decisions, (N,) each: by its supervisor, under an
+    innovation alarm, and with an estimate within two of its sd of the true value, by the estimate's name.
     """
 
     od: Array
@@ -123,22 +123,22 @@ class DensityTrial(Trial):
     told: Mapping[str, Array] = field(default_factory=dict)
 
     def score(self, window: Window, of: str = "measured") -> WindowMetrics:
-        """Metrics of a window.
+        """Compute the metrics of a window.
 
-        Args: of: `measured`, the OD as the paper takes it; `clean`, the noise-free OD: how well the culture really was
-          on the setpoint; `floor`, the sensor's error alone: what a culture exactly on the setpoint would be scored.
+        Args: of: `measured`, the OD as in the paper; `clean`, the noise-free OD; `floor`, the error of the sensor
+        alone, i.e. the score of a culture exactly on the setpoint.
         """
         od = {"measured": self.od, "clean": self.clean, "floor": self.od - self.clean}[of]
         setpoint = 0.0 if of == "floor" else window.setpoint
         return window_metrics(np.broadcast_to(self.minute, od.shape), od, setpoint, window.start, window.end)
 
     def media(self, window: Window) -> Array:
-        """Fresh medium delivered within the window, mL, (N,)."""
+        """Return the fresh medium delivered within the window, mL, (N,)."""
         first, last = np.searchsorted(self.minute, [window.start - 1e-6, window.end - 1e-6])
         return np.asarray(self.media_ml[:, last] - self.media_ml[:, first])
 
     def effort(self, window: Window) -> Array:
-        """Control effort: mean change of the pump rate from one decision to the next, µL/s, (N,)."""
+        """Return the control effort: mean change of the pump rate between decisions, µL/s, (N,)."""
         inside = (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
         return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, inside], axis=1)).mean(axis=1))
 
@@ -151,14 +151,14 @@ def closed(
     seed: int,
     make: Callable[[Plant, Bench], tuple[Controller, Sequence[Signal], SafetyConfig]],
 ) -> tuple[ClosedLoop, Plant]:
-    """Close a loop around N replicates, which are named M0, M1, ..., as one batch.
+    """Close a loop around N replicates, named M0, M1, ..., as one batch.
 
     The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
 
-    Args: model: control period and largest pump rate, the interlock's limit. make: from the vials and their bench what
-      controls the density, the signals beside it, and the limits of the interlock.
+    Args: model: control period and largest pump rate, the interlock's limit. make: function of the vials and their
+    bench; returns the density controller, further signals, and the interlock's limits.
     """
-    if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
+    if plant_config.sensor.noise_floor == 0.0:  # the interlock treats a sensor that repeats exactly as dead
         plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
     bench = Bench(period_s=60.0 * model.control_min, max_rate=model.max_pump_rate)
     plant = Plant(plant_config, replicates, np.random.default_rng(seed), bench.volume_ml)
@@ -174,7 +174,7 @@ def closed(
 
 
 def record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
-    """Run a loop to its end; return the minutes of its schedule, (K,), and what is seen at each, (N, K) by name."""
+    """Run a loop to its end; return the minutes of its schedule, (K,), and the values at each, (N, K) by name."""
     schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
     minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
     stored: dict[str, Array] = {}
@@ -195,9 +195,9 @@ def run_trial(
     replicates: int,
     seed: int,
 ) -> DensityTrial:
-    """Run N replicates of a loop that holds the density.
+    """Run N replicates of a density loop.
 
-    Args: cell: what it is called. make: builds the controller for a plant. The others: of `_closed`.
+    Args: cell: its names. make: builds the controller for a plant. The others: of `_closed`.
     """
     loop, plant = closed(
         plant_config, schedule, model, replicates, seed, lambda vials, _: (make(vials), (), SafetyConfig())
@@ -231,7 +231,7 @@ SPLITS: list[Split] = []
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:
-    """Every closed loop that some study needs, once, in the order in which they are asked for."""
+    """List every closed loop of the studies once, in order."""
     wanted: dict[Cell, None] = {}
     for study in config.studies.values():
         for scenario in study.scenarios:
@@ -244,11 +244,11 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
 
 
 Followed = tuple[Policy, EstimateBounds | None]
-"""A policy, and within which errors of its estimator its certificate lets it act."""
+"""A policy, and the estimator's error bounds of its certificate."""
 
 
 def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
-    """Run a trial in which a controller holds the density behind an interlock."""
+    """Run a trial of a density controller behind an interlock."""
     policy, bounds = followed or (None, None)
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
@@ -262,16 +262,16 @@ RUNS: dict[str, Run] = {"density": _density}
 
 
 def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
-    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    """Run one closed loop of a benchmark; it depends only on its arguments, so every process gives the same."""
     guests.load("experiments.comparison")
     return RUNS[cell.signal](config, cell, followed)
 
 
 class Loops:
-    """Runs cells in processes of their own, one per core, from `start` on.
+    """Runner of cells in separate processes, one per core, from `start` on.
 
     Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
-    A context: leaving it stops what has not begun, and by an exception also what runs.
+    A context: its end cancels waiting cells, an exception also running ones.
     """
 
     def __init__(self, config: BenchmarkConfig) -> None:
@@ -289,7 +289,7 @@ class Loops:
                 self._running[self._pool.submit(run_cell, self.config, cell, followed)] = cell
 
     def _finished(self) -> Iterator[tuple[Cell, Trial]]:
-        """Every cell with its trial, as they come."""
+        """Yield every cell with its trial, as they finish."""
         for cell, followed in self._waiting.items():
             yield cell, run_cell(self.config, cell, followed)
         for future in as_completed(self._running):

@@ -151,6 +151,9 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         policy = policies.load(path)
         training = Training.of(policy)
         fastest = 0.0 if training.relative else float(policy.actions.max())
+    if policy.observation not in (policies.ABSOLUTE, policies.RELATIVE):
+        seen = ", ".join(policy.observation)
+        raise frame.UserError(f"policy {path} observes {seen}; give a policy of env=sim or env=relative")
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
         raise messages.OtherPeriod(path=path, own_min=training.control_min, asked_min=control_min)
     if not fastest <= max_rate + 1e-12:

@@ -118,7 +118,8 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
     yield HEAD
     if scenario.recovery_od:
         longest = f"at most {scenario.recovery_limit_min:g} min; the times below count from its end"
-        yield f"  {'recovery':>8} grows undiluted to OD {scenario.recovery_od:g}, {longest}"
+        beyond = "" if scenario.recovery == "grow" else "beyond and is diluted to "
+        yield f"  {'recovery':>8} grows undiluted {beyond or 'to '}OD {scenario.recovery_od:g}, {longest}"
     for k, (setpoint, most_min, degc) in enumerate(
         zip(scenario.setpoints, scenario.minutes, scenario.temperatures, strict=True)
     ):

@@ -1,4 +1,4 @@
-"""What a controller is: N reactors in, N pump rates out, once per sample. Structural; nothing has to inherit."""
+"""Interface of a controller: N pump rates for N reactors, once per sample. A structural type without inheritance."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """What the config of every controller has."""
+    """Common config of every controller."""
 
     kind: str = setting("", "controller")
 
@@ -25,51 +25,51 @@ class ControllerConfig:
 
 
 class Controller(Protocol):
-    """Decides one pump rate per reactor and sample.
+    """Controller of one pump rate per reactor and sample.
 
     The same controller serves one reactor on the bench and 64 replicates in simulation. Reactors are independent:
-    row i of a batch does exactly what the controller would do for that reactor alone. One with a memory declares
-    `remembers`, everything that `reset` forgets, for a resumed run (`hardware/memory.py`).
+    row i of a batch gives the same result as that reactor alone. A controller with a memory declares it in `remembers`,
+    for a resumed run (`hardware/memory.py`).
     """
 
     def reset(self, n: int) -> None:
-        """Forget everything; from here on there are n reactors, at the start of a run."""
+        """Forget everything; start a run with n reactors."""
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """Pump rates for the coming control period, mL/s, shape (N,).
+        """Return the pump rates for the next control period, mL/s, shape (N,).
 
         Args:
-          od: newest reading, shape (N,); nan where there is none, or none that is believed.
+          od: newest reading, shape (N,); nan without a valid one.
           setpoint: OD to hold, shape (N,), > 0.
           minute: when the reading was taken, min since the run began, shape (N,).
-          rows: True where the reading is new and believed, shape (N,). Only these rows' internal state advances; what
-            is returned elsewhere is ignored.
+          rows: True for a new and valid reading, shape (N,). Only these rows' internal state advances; other returned
+          values are ignored.
         Raises: nothing for readings of any value.
         """
 
 
 @runtime_checkable
 class Explains(Protocol):
-    """A controller that can say how it came to its last decision."""
+    """A controller that can explain its last decision."""
 
     def explain(self) -> dict[str, Array]:
-        """Name -> value of the last decision, each with leading axis N."""
+        """Return name -> value of the last decision, each with leading axis N."""
 
 
 @runtime_checkable
 class Accounts(Protocol):
-    """A controller that goes by what was really dosed, which may differ from what it decided."""
+    """A controller that uses the volume delivered, which may differ from its decision."""
 
     def dosed(self, volume_ml: Array) -> None:
-        """Fresh medium that went in, or was put off to the next dose, since this was last called, mL, shape (N,)."""
+        """Take the volume delivered, or carried over to the next dose, since the last call, mL, shape (N,)."""
 
 
 class Speeds(Protocol):
-    """What an estimator knows of how fast a culture goes up and down (`experiments/laws/density/estimators.py`)."""
+    """Estimates of how fast the OD of a culture can rise and fall (`experiments/laws/density/estimators.py`)."""
 
     @property
     def full_pump(self) -> Array:
-        """What one period of full pump takes off ln OD, (N,)."""
+        """Decrease of ln OD in one period at full pump rate, (N,)."""
 
     def relative(self, setpoint: Array) -> tuple[Array, Array]:
         """Return error and growth share, (N,) each."""
@@ -85,7 +85,7 @@ class Estimates(Protocol):
 
 @runtime_checkable
 class Watches(Protocol):
-    """A controller that learns from every believed reading, also before the schedule begins, and from temperature."""
+    """A controller that uses every valid reading, also before the schedule begins, and temperatures."""
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Watch a sample before each `act`; arguments as there, also in recovery; temperature: degC, nan if unknown."""

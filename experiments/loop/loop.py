@@ -76,8 +76,8 @@ class Step:
 class ClosedLoop:
     """Signals x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
 
-    Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time. A reading
-    that the interlock does not believe begins no schedule and is not shown to the controller.
+    Each reactor first recovers (grows to `recovery_od`, or beyond and is diluted to it), then runs its schedule on its
+    own time. A reading that the interlock does not believe begins no schedule and is not shown to the controller.
 
     Args:
       reactors: N reactors. controller: decides on the feed. interlock: of N reactors.
@@ -122,8 +122,6 @@ class ClosedLoop:
         self._commanded = [(signal, by_name[signal.actuator]) for signal in further if signal.actuator]
         self._before_dose = before_dose
         self._at_end = np.array([at_end] * n if isinstance(at_end, str) else list(at_end))
-        self._recovery_od = np.array([s.recovery_od for s in self.schedules])
-        self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
         asked = [actuator.pump for _, actuator in self._commanded if actuator.pump]
         self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s, asked)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
@@ -157,7 +155,7 @@ class ClosedLoop:
         rows = m.fresh & ~(self.done & (self._at_end == "stop")) & ~self.stopped
         minute = m.time_s / 60.0
         believed = rows & self.interlock.believes(m)
-        recovered = (believed & (m.od >= self._recovery_od)) | (minute >= self._recovery_limit)
+        recovered, dilutes = self.progress.recover(minute, m.od, believed)
         self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
         elapsed = minute - self.began
         ended = self.progress.watch(elapsed, m.od, believed)
@@ -178,6 +176,7 @@ class ClosedLoop:
             commands[actuator.name] = command
         steered = believed & (phase >= 0)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
+        proposed = np.where(dilutes & np.isnan(self.began), self.interlock.bench.max_rate, proposed)
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
         proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.bench.period_s)
         verdict = self.interlock.check(m, proposed, self.density.aim, temperature, now)

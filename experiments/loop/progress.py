@@ -30,7 +30,7 @@ class Progress:
     `settled_band` times the setpoint at every believed sample of `settled_min`, counted anew in every step.
 
     Attributes: edges, start of each step and end of the last, min since the schedule began, (N, P + 1), inf behind the
-    last. conditional, whether any step has a condition; remembers, nothing where none has.
+    last. conditional, whether any step has a condition; remembers, nothing where none has and no recovery dilutes.
     """
 
     def __init__(self, schedules: Sequence[Scenario]) -> None:
@@ -41,13 +41,18 @@ class Progress:
         width = int(self._counts.max())
         self.conditions = Conditions([[*s.until, *[None] * (width - len(s.until))] for s in schedules])
         self.conditional = self.conditions.any
-        self.remembers = ("edges", "within_since", "judged_at") if self.conditional else ()
+        self._dilutes = np.array([s.recovery == "dilute" for s in schedules])
+        watched = ("edges", "within_since", "judged_at") if self.conditional else ()
+        self.remembers = (*watched, *(["grown"] if self._dilutes.any() else []))
+        self._recovery_od = np.array([s.recovery_od for s in schedules])
+        self._recovery_limit_min = np.array([s.recovery_limit_min for s in schedules])
         self._announced_min = np.array([s.announced_min for s in schedules])
         self._band = np.array([s.settled_band for s in schedules])
         self._settled_min = np.array([s.settled_min for s in schedules])
         self.edges = _padded([s.edges.tolist() for s in schedules], np.inf)
         self._within_since = np.full(len(schedules), np.nan)  # min, from which on no reading was outside the band
         self._judged_at = np.full(len(schedules), np.nan)  # min, newest sample that was judged
+        self._grown = np.zeros(len(schedules), dtype=np.bool_)  # beyond where the recovery dilutes to
 
     @property
     def totals(self) -> Array:
@@ -83,6 +88,17 @@ class Progress:
         left = self.edges[rows, step + 1] - elapsed
         known = (phase >= 0) & (following > step) & (left <= self._announced_min) & ~self.conditions.given[rows, step]
         return np.where(known, self._setpoints[rows, following], setpoint), np.where(known, left, np.inf)
+
+    def recover(self, minute: Array, od: Array, believed: Mask) -> tuple[Mask, Mask]:
+        """Take a sample before the schedule; where the recovery ends, and where full pump is to dilute, each (N,).
+
+        Args: minute: of the run. believed: rows whose OD is new and believed.
+        """
+        beyond = od >= self._recovery_od * (1.0 + self._band)
+        self._grown = self._grown | (believed & beyond & self._dilutes)
+        there = np.where(self._dilutes, self._grown & (od <= self._recovery_od), od >= self._recovery_od)
+        over = (believed & there) | (minute >= self._recovery_limit_min)
+        return over, believed & self._grown & ~over
 
     def watch(self, elapsed: Array, od: Array, believed: Mask) -> Mask:
         """Take a sample; True where it ends a step, (N,). Args: believed: rows whose OD is new and believed."""

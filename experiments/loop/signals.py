@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from conf.messages import NameTaken
 from envs.bench import Bench
 from envs.plant.plant import Plant
+from envs.preview import half_way
 from envs.scenario import Scenario
 from experiments.laws.base import Accounts, Array, Controller, Estimates, Explains, Mask, Watches
 from experiments.loop import messages
@@ -43,7 +44,6 @@ __all__ = [
 
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
-MOST_PERIODS = 1e4  # for half of a transition that the estimate takes for impossible
 AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
 PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "journal_row")
@@ -184,10 +184,9 @@ class Density:
     A culture of volume s V answers to a rate s u as one of V does to u, since tau = V/60. So a law whose model is of V
     decides for every volume.
 
-    A change of the setpoint that is known ahead is aimed at half of its transition before it comes: OD is half-way, in
-    ln OD, when the setpoint changes, and the integral of the squared error is a quarter of what it is without. The
-    transition takes |ln(r'/r)| / (s B) periods up and |ln(r'/r)| / ((1 - s) B) down, with growth share s and full pump
-    B as the law estimates them (`envs/relative.py`).
+    A change of the setpoint that is known ahead is begun so early that OD is half-way when it comes (`half_way`): the
+    integral of the squared error is a quarter of what it is without. The aim is the next setpoint where OD lags behind
+    that way, else the way's next OD, by growth share and full pump as the law estimates them.
 
     Args: law: decides on the pump rate; what it can do beyond is asked of it. scale: s, (N,) or one for all.
       max_rate: largest rate, mL/s. period_min: control period.
@@ -235,12 +234,11 @@ class Density:
     def _aim(self, sample: Sample) -> Array:
         if sample.following is None or sample.left_min is None or not isinstance(self.law, Estimates):
             return sample.setpoint
-        full, share = self.law.estimator.full_pump, self.law.estimator.relative(sample.setpoint)[1]
-        change = np.log(sample.following / sample.setpoint)
-        speed = full * np.where(change > 0.0, share, 1.0 - share)  # of ln OD in one period
-        half = np.divide(0.5 * np.abs(change), speed, out=np.full(share.size, MOST_PERIODS), where=speed > 0.0)
-        begun = sample.left_min <= (half + 0.5) * self._period_min  # by the sample that is nearest
-        return np.where(begun, sample.following, sample.setpoint)
+        full, (error, share) = self.law.estimator.full_pump, self.law.estimator.relative(sample.setpoint)
+        now, left = (sample.setpoint, sample.following), sample.left_min / self._period_min
+        here, ahead = (half_way(*now, left - later, full, share) for later in (0.0, 1.0))
+        behind = np.sign(sample.following - sample.setpoint) * (error * full - np.log(here / sample.setpoint)) < 0.0
+        return np.where(behind & (ahead != sample.setpoint), sample.following, ahead)
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """See `Signal.find`; in a simulation also what e and s truly are, where the law estimates them."""

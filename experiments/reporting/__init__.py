@@ -1,3 +1,3 @@
-"""What people look at: charts, tables, pages, TensorBoard. Arrays and dictionaries in, files out.
+"""Charts, tables, pages, TensorBoard: files from arrays and dictionaries.
 
-Entered by commands and by every room above; imports no other room of the experiments."""
+Commands and other rooms import it; it imports no other room of the experiments."""

@@ -1,4 +1,4 @@
-"""Figures of a calibration: measured against model, drift along the recording, coverage; of a run against its model."""
+"""Figures of a calibration: measurement and model, drift, coverage; comparison of a run with its model."""
 
 from collections.abc import Mapping
 
@@ -24,10 +24,10 @@ ESTIMATOR, MARK = PUMP, REJECTED
 
 
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
-    """Measured OD with the model of the returned method, what it misses below, and the pump rate.
+    """Draw measured OD with the model of the returned method, its errors below, and the pump rate.
 
-    prediction_error: the OD that all readings before and the pump predict, and the innovations in their own sd;
-    free_run: the free-running trajectory and its residuals. The free run of the other pair is drawn thin beside.
+    prediction_error: the OD predicted from earlier readings and the pump, and the innovations in their sd; free_run:
+    the free trajectory and its residuals. A thin line is the free run of the other pair.
     Args: raw: the recording before screening, at the same positions as `result`'s. result: of `calibrate`.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
@@ -78,7 +78,7 @@ def _model_label(result: Calibration) -> str:
 
 
 def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
-    """Draw readings, used and rejected; those beyond the scale are triangles on the upper edge."""
+    """Draw used and rejected readings; those beyond the scale are triangles on the upper edge."""
     hours, clean = raw.time / 60, result.screened.series.od
     a, b = result.window
     window = np.zeros(len(hours), dtype=np.bool_)
@@ -102,7 +102,7 @@ def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
 
 
 def drift_figure(result: Calibration, title: str) -> Figure:
-    """Draw mu and tau of each segment fitted alone, beside the returned pair and its window."""
+    """Draw mu and tau of each separately fitted segment, the returned pair and its window."""
     figure, axes = new_figure(9.5, 6.2, 2, sharex=True)
     time = result.screened.series.time / 60
     a, b = result.window
@@ -127,7 +127,7 @@ def drift_figure(result: Calibration, title: str) -> Figure:
 
 
 def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list[Parameter | None]) -> list[float]:
-    """Draw the estimates with their intervals; returns the middles (h) of the segments that have one."""
+    """Draw the estimates with their intervals; return the middles (h) of segments with an estimate."""
     known = [(s, v) for s, v in zip(segments, values, strict=True) if v is not None]
     if not known:
         ax.text(0.5, 0.5, "not identifiable in any segment", transform=ax.transAxes, ha="center", color="0.4")
@@ -147,7 +147,7 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
 
 
 def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: str) -> Figure:
-    """Intervals of many simulated recordings against the truth, sorted by estimate; misses in colour.
+    """Draw intervals of many simulated recordings and the true value, sorted by estimate; misses in colour.
 
     Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: of mu and of tau, shape (N,) each.
     """
@@ -174,9 +174,9 @@ def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: st
 
 
 def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> Figure:
-    """mu(t) and tau(t) of the twin with their 95 % bands, above the trustworthy readings.
+    """Draw mu(t) and tau(t) of the twin with 95 % bands, above the trustworthy readings.
 
-    Args: raw, result: as `fit_figure`. behind: the twin of both.
+    Args: raw, result: as `fit_figure`. behind: the twin.
     """
     figure, axes = new_figure(9.5, 7.2, 3, sharex=True, height_ratios=(1.2, 1.2, 1.0))
     clean, (a, b) = result.screened.series, result.window
@@ -209,9 +209,9 @@ def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> F
 
 
 def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervised: Array, title: str) -> Figure:
-    """Growth rate and pump gain as the recording shows them, the model's values, and what its predictions missed.
+    """Draw growth rate and pump gain of the recording, the model's values, and the errors of its predictions.
 
-    Args: estimator: what the controller believed: `minute`, and `mu` (1/min) or `gain` where it has one, all (K,).
+    Args: estimator: the controller's estimates: `minute`, and `mu` (1/min) or `gain` if it has one, all (K,).
       supervised: minutes at which a supervisor acted, (S,).
     """
     figure, axes = new_figure(9.5, 7.4, 3, sharex=True, height_ratios=(1.2, 1.2, 1.0))

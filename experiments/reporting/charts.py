@@ -39,7 +39,7 @@ matplotlib.rcParams.update(
         "legend.fontsize": 8,
         "legend.frameon": False,
         "svg.fonttype": "none",  # text stays text
-        "svg.hashsalt": "turbidostat-dqn",  # the same figure is the same file
+        "svg.hashsalt": "turbidostat-dqn",  # makes files reproducible
     }
 )
 
@@ -56,31 +56,31 @@ def save(figure: Figure, folder: Path, name: str) -> Path:
     """Write folder/name.svg and folder/name.png; returns the path of the PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-    figure.set_layout_engine(None)  # everything has found its place, which takes longer than to draw it
+    figure.set_layout_engine(None)  # the layout is final; it takes longer than drawing
     figure.savefig(folder / f"{name}.png", dpi=150)
     return folder / f"{name}.png"
 
 
 def _plain(axis: Axis) -> None:
-    """0.01 instead of a power of ten at the ticks of a logarithmic axis: superscripts cost more than all the rest."""
+    """Write 0.01 instead of a power of ten at ticks of a logarithmic axis, because superscripts are slow to draw."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(_Plain(labelOnlyBase=False))
 
 
 class _Plain(LogFormatter):
-    """Labels the ticks that its base would, as plain numbers."""
+    """Formatter of the same ticks as its base, with plain numbers."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def pump_end(*rates: Array) -> float:
-    """Where an axis of pump rates in mL/s ends, uL/s: as on the usual bench, or beyond the largest that is drawn."""
+    """Return the end of a pump rate axis in uL/s, for rates in mL/s: the usual bench's, or beyond the largest rate."""
     return max(21.0, *(1050.0 * float(np.nanmax(rate, initial=0.0)) for rate in rates))
 
 
 def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:
-    """One line for one agent; median, quartiles and range for several. curves: (K, S)."""
+    """Draw one line for one agent; median, quartiles and range for several. curves: (K, S)."""
     if curves.shape[1] == 1:
         ax.plot(x, curves[:, 0], color=colour, linewidth=1.2, label=label)
         return
@@ -92,7 +92,7 @@ def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> N
 
 
 def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_step: Array) -> Figure:
-    """Reward per episode (the paper's Fig. 2b) and regret of the greedy policy during training.
+    """Draw reward per episode (the paper's Fig. 2b) and regret of the greedy policy during training.
 
     Args:
       episode_return: (episodes, S). eval_step: (K,). regret_pct: on the selection grid, (K, S).
@@ -116,7 +116,7 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
 
 
 def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Figure:
-    """Pump rate over OD and setpoint, learned beside optimal.
+    """Draw the learned and the optimal pump rate over OD and setpoint.
 
     Args: od (X,), setpoint (Y,), learned and optimal (Y, X) in mL/s.
     """
@@ -136,7 +136,7 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
 
 
 def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates: Array, best_rates: Array) -> Figure:
-    """Noise-free closed loops of the learned policy and the optimum from the same starts, a column per setpoint.
+    """Draw noise-free closed loops of the learned policy and the optimum from the same starts, a column per setpoint.
 
     Args:
       minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
@@ -162,7 +162,7 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
 
 
 def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> Figure:
-    """Share of the largest pump rate over error and growth share, learned beside optimal.
+    """Draw the learned and the optimal fraction of the largest pump rate over error and growth share.
 
     Args: error (X,), periods of full pump; share (Y,); learned and optimal (Y, X), 0 to 1.
     """
@@ -181,13 +181,13 @@ def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> 
 
 
 def relative_trajectories(error: Array, best: Array, share: Array, levels: Array, best_levels: Array) -> Figure:
-    """Noise-free closed loops in relative coordinates, a column per growth share.
+    """Draw noise-free closed loops in relative coordinates, a column per growth share.
 
     Args: error, best: e including the start, (K + 1, G). share: (G,). levels, best_levels: (K, G), 0 to 1.
     """
     shares = np.unique(share)
     figure, axes = new_figure(3.4 * shares.size, 4.6, 2, shares.size, sharex=True, sharey="row", height_ratios=[2, 1])
-    shown = 40  # periods; what comes after is rest
+    shown = 40  # periods; later the loop is at rest
     for column, each in enumerate(shares):
         top, bottom = axes[column], axes[shares.size + column]
         for k, g in enumerate(np.flatnonzero(share == each)):
@@ -218,8 +218,8 @@ def closed_loop(
     """Draw a recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
-      marks: minute and text of vertical lines. refused: OD that was not believed, (K, N); at the edge where it is far.
-      aim: setpoint that the controller was given, (K, N), where changes are known ahead.
+      marks: minute and text of vertical lines. refused: rejected OD, (K, N); far values at the edge.
+      aim: setpoint given to the controller, (K, N), with announced changes.
     """
     unit, sign = clock(float(np.nanmax(minutes, initial=0.0)))
     time, rows = minutes / unit, 2 if temperature is None else 3

@@ -1,6 +1,6 @@
-"""What the curves in TensorBoard are called, what they mean, and how they are laid out on its custom page.
+"""Tags of TensorBoard's curves, their meaning, and their layout on the custom page.
 
-docs/tensorboard.md explains the same tags to whoever looks at them.
+docs/tensorboard.md explains the same tags to users.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,27 +28,27 @@ class Curve:
 
     @property
     def text(self) -> str:
-        """As TensorBoard shows it."""
+        """Text that TensorBoard shows."""
         return f"{self.what}. Unit: {self.unit or 'none'}."
 
 
 CURVES = {
     # training, over environment steps
-    "train/return": Curve("OD² for env=sim", "reward of the episode that ended, minus its cost; the agent explores"),
+    "train/return": Curve("OD² for env=sim", "return of the last episode (minus its cost), with exploration"),
     "train/loss": Curve("squared TD error", "loss of the updates since the last point"),
-    "train/epsilon": Curve("", "share of actions taken at random"),
+    "train/epsilon": Curve("", "fraction of random actions"),
     "q/min": Curve("reward", "lowest Q value of a minibatch"),
     "q/max": Curve("reward", "highest Q value of a minibatch; no return is above 0"),
     "eval/regret_pct": Curve("%", "cost of the greedy policy beyond the optimum's, selection grid"),
     "eval/steady_abs_error": Curve("OD for env=sim", "error at rest at the worst setpoint, selection grid"),
-    "kept/regret_pct": Curve("%", "regret of the policy that is kept, selection grid"),
-    "kept/steady_abs_error": Curve("OD for env=sim", "error at rest of the policy that is kept, selection grid"),
-    "limit/regret_pct": Curve("%", "regret that training aims for"),
-    "limit/steady_abs_error": Curve("OD for env=sim", "error at rest that training aims for"),
+    "kept/regret_pct": Curve("%", "regret of the kept policy, selection grid"),
+    "kept/steady_abs_error": Curve("OD for env=sim", "error at rest of the kept policy, selection grid"),
+    "limit/regret_pct": Curve("%", "target of training for the regret"),
+    "limit/steady_abs_error": Curve("OD for env=sim", "target of training for the error at rest"),
     "speed/steps_per_s": Curve("1/s", "environment steps of all agents together"),
     # a deployment, over minutes of the run
     "culture/od": Curve("OD", "optical density as measured"),
-    "culture/setpoint": Curve("OD", "density asked for"),
+    "culture/setpoint": Curve("OD", "setpoint of the density"),
     "culture/setpoint_low": Curve("OD", "5 % below the setpoint"),
     "culture/setpoint_high": Curve("OD", "5 % above the setpoint"),
     "culture/temperature_degc": Curve("°C", "of the vial"),
@@ -57,17 +57,17 @@ CURVES = {
     "safety/interlock": Curve("", "1 where the interlock or a warning spoke"),
     "controller/q_best": Curve("reward", "Q value of the chosen pump rate"),
     "controller/q_lead": Curve("reward", "its lead over the second best"),
-    "controller/error": Curve("periods of full pump", "error that the policy saw"),
-    "controller/growth_share": Curve("", "share of the pump that growth takes, as the policy saw it"),
-    "controller/supervised": Curve("", "1 where the supervisor's law acts in place of the policy"),
-    "controller/alarm": Curve("", "1 where it does because readings do not fit what the estimator believes"),
-    "controller/error_sd": Curve("periods of full pump", "standard deviation of the error that the policy saw"),
-    "controller/growth_share_sd": Curve("", "standard deviation of the growth share that it saw"),
-    "controller/true_error": Curve("periods of full pump", "the error in truth, in a simulation"),
-    "controller/true_growth_share": Curve("", "the growth share in truth, in a simulation"),
-    "controller/od_estimate": Curve("OD", "density as the controller believes it"),
-    "controller/mu": Curve("1/min", "growth rate as the controller believes it"),
-    "controller/gain": Curve("", "pump gain as the controller believes it, 1 = the model's"),
+    "controller/error": Curve("periods of full pump", "error, input of the policy"),
+    "controller/growth_share": Curve("", "growth share, input of the policy"),
+    "controller/supervised": Curve("", "1 if the supervisor's controller acts in place of the policy"),
+    "controller/alarm": Curve("", "1 if it acts because innovations do not fit the estimate"),
+    "controller/error_sd": Curve("periods of full pump", "standard deviation of that error"),
+    "controller/growth_share_sd": Curve("", "standard deviation of that growth share"),
+    "controller/true_error": Curve("periods of full pump", "true error, in a simulation"),
+    "controller/true_growth_share": Curve("", "true growth share, in a simulation"),
+    "controller/od_estimate": Curve("OD", "estimated density"),
+    "controller/mu": Curve("1/min", "estimated growth rate"),
+    "controller/gain": Curve("", "estimated pump gain, 1 = the model's"),
     "controller/noise": Curve("", "scatter of the readings over the assumed one"),
     "controller/p": Curve("mL/s; 1/min for pi_tuned", "proportional part of a PI"),
     "controller/i": Curve("1/min", "integral part of pi_tuned"),
@@ -89,7 +89,7 @@ PICTURES = {
 
 
 def described(tag: str) -> str:
-    """Describe a tag for TensorBoard; statistics of a population say which."""
+    """Describe a tag for TensorBoard, with the statistic of a population."""
     base, _, end = tag.rpartition("/")
     if base in CURVES and end in POPULATION:
         return f"{CURVES[base].text} {POPULATION[end].capitalize()}."
@@ -175,13 +175,13 @@ class Column:
 
 
 PARAMETERS = {
-    "decides": Column("agent or controller", "preset of hyper-parameters, or what decided the pump rate"),
-    "on": Column("model or plant", "what was learned on, or controlled"),
+    "decides": Column("agent or controller", "preset of hyper-parameters, or controller"),
+    "on": Column("model or plant", "model of training, or controlled plant"),
     "seed": Column("seed", "of the agent, or of the simulated vials", number=True),
     "mu": Column("mu, 1/min", "growth rate of the model or plant", number=True),
     "tau": Column("tau", "volume over 60 times the flow of the pump", number=True),
     "command": Column("command", "train or deploy"),
-    "scenario": Column("scenario", "what a deployment was asked for"),
+    "scenario": Column("scenario", "schedule of a deployment"),
     "steps": Column("steps", "of training", number=True),
     "given": Column("given", "keys and values of the command line; a run whose columns are shown may lack some"),
 }

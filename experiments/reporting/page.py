@@ -1,7 +1,6 @@
 """A run folder as one self-contained HTML page: tables, figures, configuration.
 
-The page links to nothing: figures stand in it as images (SVG, or PNG where there is no SVG), the style too. Its
-markup is report.html.j2.
+The page has no links: figures (SVG, else PNG) and style are embedded. Its markup is report.html.j2.
 """
 
 import base64
@@ -27,7 +26,7 @@ __all__ = ["Page", "flat", "of_runs", "provenance", "save"]
 
 PACKAGE = "turbidostat-dqn"
 HERE = Path(__file__).parent
-PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, what such a file holds
+PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, pattern of its content
 
 LARGEST = 200_000  # characters of a configuration
 ALIAS = re.compile(r"(?:^|[\s\[,:-])[&*]\w", re.MULTILINE)
@@ -40,7 +39,7 @@ UNITS = {
     "od_abs_error_mean": "OD", "mu": "1/min", "regret_pct_last": "%",
     "optimum_cost": "squared error",
 }  # fmt: skip
-"""Of keys of summary.json; a key with one of `ENDINGS` has its unit in it."""
+"""Labels of keys of summary.json; a key with one of `ENDINGS` contains its unit."""
 ENDINGS = {"_pct": "%", "_min": "min", "_ml": "mL", "_s": "s"}
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
@@ -50,7 +49,7 @@ templates.tests["best"] = lambda cell: isinstance(cell, Emphasis)
 
 @dataclass
 class Page:
-    """A page under construction: headings, each with its blocks, and the tables among them.
+    """A page: headings with their blocks, and its tables.
 
     A block is the name of a macro of report.html.j2 and its arguments.
     """
@@ -73,15 +72,15 @@ class Page:
         self.add("paragraph", text=text)
 
     def table(self, table: Table, folded: str = "") -> None:
-        """Append a table, behind a heading to click on if `folded` gives one."""
+        """Append a table, folded under the heading `folded` if given."""
         self.tables.append(table)
         self.add("table", table=table, folded=folded)
 
     def figure(self, path: Path, title: str, caption: str = "") -> None:
         """Append a figure file, SVG or PNG.
 
-        Whoever wrote it: a browser runs no script of an image and follows no address in it.
-        Raises: ValueError for a file that is no picture, OSError for one that cannot be read.
+        The file may be foreign: a browser runs no script of an image and follows no address in it. Raises: ValueError
+        for a file that is no image, OSError for an unreadable one.
         """
         media, mark = PICTURES.get(path.suffix, ("", b""))
         data = path.read_bytes() if media else b""
@@ -95,7 +94,7 @@ class Page:
 
 
 def _version() -> str:
-    """Of this package; where it runs from its sources without being installed, what pyproject.toml says."""
+    """Return the version of this package; from pyproject.toml if it is not installed."""
     try:
         return metadata.version(PACKAGE)
     except metadata.PackageNotFoundError:
@@ -115,7 +114,7 @@ def _other_versions() -> str:
 
 
 def provenance(page: Page, run: Path) -> None:
-    """Add what was run: command, seed, versions, and the whole configuration to unfold."""
+    """Add command, seed, versions, and the folded configuration."""
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)
@@ -129,7 +128,7 @@ def provenance(page: Page, run: Path) -> None:
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Leaves of nested mappings with dotted names; lists count as leaves."""
+    """Yield leaves of nested mappings with dotted names; lists are leaves."""
     for key, item in value.items():
         if isinstance(item, Mapping):
             yield from flat(item, f"{prefix}{key}.")
@@ -138,7 +137,7 @@ def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 def _config(text: str) -> Mapping[str, Any]:
-    """Read the configuration of a run; {} for one that cannot be read, or that refers to itself."""
+    """Read the configuration of a run; {} if it is unreadable or recursive."""
     if len(text) > LARGEST or ALIAS.search(text):
         return {}
     try:
@@ -149,7 +148,7 @@ def _config(text: str) -> Mapping[str, Any]:
 
 
 def _near(text: str) -> str:
-    """Without paths of this machine: relative to where the command runs, or the last two names."""
+    """Shorten a path: relative to the working folder, or its last two names."""
 
     def short(match: re.Match[str]) -> str:
         path = Path(match[0])
@@ -161,7 +160,7 @@ def _near(text: str) -> str:
 
 
 def _labelled(key: str, kind: str) -> str:
-    """Label a key of summary.json with its unit. Args: kind: of the task whose error it may be."""
+    """Label a key of summary.json with its unit. Args: kind: of the task, for the unit of errors."""
     *parents, name = key.split(".")
     unit = UNITS.get(parents[-1] if parents and name in ("value", "ci95") else name, "")
     if unit == "OD" and "error" in name:
@@ -185,22 +184,22 @@ def _show(value: Any) -> str:
 
 
 def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
-    """summary.json of a run folder, and its configuration."""
+    """Read summary.json of a run folder, and its configuration."""
     path = run / "config.yaml"
     config = _config(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
 
 
 def _told(runs: Iterable[Path]) -> list[Headline]:
-    """List the verdicts of the runs that have one."""
+    """List the verdicts of the runs."""
     found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
     return [said for said in found if said is not None]
 
 
 def _results(page: Page, run: Path, prefix: str) -> None:
-    """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder.
+    """Add summary.json as tables, whose names begin with `prefix`, and every figure of a run folder.
 
-    What a verdict has told in words is folded: its dozens of keys are those of a file.
+    With a verdict the tables are folded.
     """
     summary, config = _read(run)
     leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
@@ -227,11 +226,11 @@ def _figures(page: Page, run: Path) -> None:
 
 
 def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
-    """Build the page of any command's run: what it found, and what was run. `runs`: the folder itself or runs below it.
+    """Build the page of any command's run: results and configuration. `runs`: the folder itself or runs below it.
 
-    Of several runs it begins with what each came to.
+    For several runs it begins with the result of each.
 
-    Args: after: adds to the page what only some runs have; it is given the run and its name on a page of several.
+    Args: after: adds further parts of a run; called with the run and its name on a page of several.
     """
     name = folder.resolve()
     page = Page(f"{name.parent.name}, {name.name}", f"{PACKAGE} {_version()}")

@@ -1,4 +1,4 @@
-"""The figures of a sweep: learning curves of its configurations, and every value that was measured."""
+"""Figures of a sweep: learning curves of its configurations, and all measured values."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def _plain(axis: Axis) -> None:
-    """0.01 instead of a power of ten."""
+    """Write 0.01 instead of a power of ten."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
 
@@ -28,7 +28,7 @@ def _middle(row: Array) -> float:
 
 
 def learning_curves(curves: Sequence[tuple[str, Array, Array]], quantity: str) -> Figure:
-    """Interquartile mean over seeds as a line, the worst seed dashed, a colour per configuration.
+    """Draw the interquartile mean over seeds as a line, the worst seed dashed, a colour per configuration.
 
     Args: curves: name, steps (K,), values (K, S). quantity: with its unit.
     """

@@ -11,8 +11,8 @@ from experiments.reporting.tables import Emphasis, Table, number
 
 __all__ = ["of_sweep", "repeats"]
 
-LONG = 40  # characters of a name that gives way to its place in the table
-DRAWN = 8  # configurations in a figure, as many as there are colours; the table has all
+LONG = 40  # characters of a name, beyond which its row number is shown
+DRAWN = 8  # configurations in a figure, one per colour; the table has all
 SHOWN = 4  # measures on the page
 STATISTICS = ("n", "median", "IQM", "95 % of IQM", "worst")
 
@@ -33,7 +33,7 @@ def _measures(ranked: Sequence[Configuration]) -> list[str]:
 
 
 def _cells(one: Configuration, name: str) -> list[str]:
-    """n, median, interquartile mean, its interval, worst."""
+    """Format n, median, interquartile mean, its interval, worst."""
     if name not in one.measured:
         return ["–"] * len(STATISTICS)
     s = statistics(one.measured[name])
@@ -47,7 +47,7 @@ def _row(place: int, one: Configuration, names: Sequence[str]) -> tuple[str, ...
 
 
 def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str], str], note: str) -> None:
-    """Add a table per measure, and folded away all of them side by side, as configurations.csv has them."""
+    """Add a table per measure, and a folded table of all measures, as in configurations.csv."""
     names = _measures(ranked)
     for name in names:
         rows = tuple(_row(k + 1, one, [name]) for k, one in enumerate(ranked))
@@ -107,7 +107,7 @@ def _missing(page: Page, jobs: Sequence[Result], again: str) -> None:
 
 
 def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: Callable[[str], str]) -> None:
-    """Learning curves where there are any; the values of the first measure otherwise, and of the others."""
+    """Draw learning curves, or else the values of the first measure; then the values of the others."""
     shown = {one.name if len(one.name) < LONG else f"#{k + 1}": one for k, one in enumerate(ranked[:DRAWN])}
     note = f"The best {DRAWN} of {len(ranked)} configurations." if len(ranked) > DRAWN else ""
     page.section("Figures")
@@ -128,7 +128,7 @@ def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: 
 def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> Page:
     """Build the page of a sweep.
 
-    Args: jobs: all of them, also those without a result. again: the command that does what is missing.
+    Args: jobs: all of them, also those without a result. again: the command that runs the missing jobs.
     """
     ranked, common = configurations(jobs)
     task = next((job.task for job in jobs if job.state == "finished"), "density")

@@ -1,4 +1,4 @@
-"""The jobs of a sweep as configurations: what differs, their seeds pooled, and statistics of what they measured."""
+"""Jobs of a sweep as configurations: their differences, pooled seeds, and statistics of their measures."""
 
 import csv
 import math
@@ -24,12 +24,12 @@ LABELS = {
     "volume_ml": "medium, mL",
     "objective": "what the command returned",
 }
-MERIT = "merit of the worst seed (1: limit of the task)"  # what train returns
+MERIT = "merit of the worst seed (1: limit of the task)"  # returned by train
 
 
 @dataclass(frozen=True)
 class Result:
-    """A job: name of its folder, overrides key -> value, state, why it failed, objective, summary, kind of its task."""
+    """A job: name of its folder, overrides key -> value, state, error, objective, summary, kind of its task."""
 
     folder: Path
     overrides: Mapping[str, str]
@@ -42,7 +42,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Jobs that differ in nothing but a seed. values: what makes them differ from others. measured: name -> (n,)."""
+    """Jobs that differ only in the seed. values: of the varied settings. measured: name -> (n,)."""
 
     values: dict[str, str]
     jobs: list[Result]
@@ -50,7 +50,7 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """What it is called in a figure."""
+        """Name in a figure."""
         return (
             ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in self.values.items()) or "all jobs"
         )
@@ -66,7 +66,7 @@ def _short(value: str) -> str:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of n values, lower being better. interval: 95 % of the interquartile mean, by bootstrap; nan for one value."""
+    """Statistics of n values. interval: 95 % of the interquartile mean, by bootstrap; nan for one value."""
 
     n: int
     median: float
@@ -76,7 +76,7 @@ class Statistics:
 
 
 def statistics(values: Array) -> Statistics:
-    """Statistics of values (n,), n >= 1. The interquartile mean is the mean of the middle half (Agarwal 2021)."""
+    """Compute statistics of n >= 1 values. The interquartile mean is that of the middle half (Agarwal 2021)."""
     from scipy.stats import trim_mean
 
     low = high = math.nan
@@ -95,10 +95,10 @@ def label(measure: str, task: str, command: str) -> str:
 
 
 def measures(summary: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Collect what a run measured: name -> a value per seed or reactor, or one. The names depend on the command.
+    """Collect the measures of a run: name -> a value per seed or reactor, or one. The names depend on the command.
 
     A training has them per seed. A closed loop has them per window: ISE and ITAE are summed over the windows of a
-    reactor, the steady error is that of its worst window. Of any other command these are its plain numbers.
+    reactor, the steady error is that of its worst window. For any other command they are its plain numbers.
     """
     if isinstance(summary.get("seeds"), list):
         return {name: _finite(summary.get(name)) for name in ("regret_pct", "steady_abs_error")}
@@ -125,9 +125,9 @@ def _of_windows(summary: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[str, str]]:
-    """Finished jobs pooled over seeds, the best first, and the overrides that all jobs share.
+    """Pool finished jobs over seeds, the best first; return also the overrides that all jobs share.
 
-    The best has the least objective at its worst seed; where no objective was returned, the least worst first measure.
+    The best has the least objective at its worst seed; without objectives, the least worst value of the first measure.
     """
     keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if key.rpartition(".")[2] != "seed"))
     done = [job for job in jobs if job.state == "finished"]

@@ -1,4 +1,4 @@
-"""A table once: its cells for a page, and the same as CSV and LaTeX."""
+"""Tables: cells for a page, CSV and LaTeX."""
 
 import csv
 import io
@@ -9,17 +9,17 @@ from pathlib import Path
 
 __all__ = ["Emphasis", "Table", "clock", "count", "markdown", "number", "plus_minus", "span", "typeset", "write"]
 
-LONG_MIN = 180.0  # what lasts longer is told in hours
+LONG_MIN = 180.0  # longer times are written in hours
 
 
 class Emphasis(str):
-    """The text of a cell that stands out."""
+    """Text of a highlighted cell."""
 
     __slots__ = ()
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Significant digits without an exponent where it is readable; a dash for what is not known."""
+    """Format significant digits, without an exponent if readable; a dash for an unknown value."""
     if value is None or value != value:
         return "–"
     if value == 0.0:
@@ -29,25 +29,25 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def plus_minus(mean: float | None, sd: float | None) -> str:
-    """Format mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
+    """Format mean ± sd, the deviation to two digits; only the mean without a deviation, or with one below rounding."""
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean)
     return f"{number(mean)} ± {number(sd, 2)}"
 
 
 def clock(last: float) -> tuple[float, str]:
-    """How long the unit of time is, min, and its sign, where the last minute to be told is `last`."""
+    """Return the unit of time in min, and its symbol, for times up to `last`."""
     return (60.0, "h") if last > LONG_MIN else (1.0, "min")
 
 
 def span(first: float, last: float) -> str:
-    """From when to when, given in minutes."""
+    """Format a time span given in minutes."""
     unit, sign = clock(last)
     return f"{'hour' if sign == 'h' else 'minute'} {round(first / unit, 1):g} to {round(last / unit, 1):g}"
 
 
 def count(n: int, one: str) -> str:
-    """So many of what is called `one` where it is alone."""
+    """Format a number of items; `one` is the singular."""
     return f"{n} {one}{'' if n == 1 else 's'}"
 
 
@@ -58,7 +58,7 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def typeset(text: str) -> str:
-    """With true minus signs before numbers, and ± for +-."""
+    """Use true minus signs before numbers, and ± for +-."""
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text.replace("+-", "±"))
 
 
@@ -84,7 +84,7 @@ class Table:
                 raise ValueError(f"table {self.name}: row of {len(row)} cells under {len(self.columns)} headings")
 
     def csv(self) -> str:
-        """Comma-separated values with the headings as first line."""
+        """Format comma-separated values with the headings as first line."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
@@ -120,7 +120,7 @@ def _tex(text: str) -> str:
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:
-    """NAME.csv and NAME.tex of each table."""
+    """Write NAME.csv and NAME.tex of each table."""
     folder.mkdir(parents=True, exist_ok=True)
     for table in tables:
         (folder / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")

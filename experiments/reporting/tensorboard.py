@@ -1,7 +1,7 @@
-"""Where the numbers of a run go for looking at: TensorBoard events, and a CSV of the same scalars.
+"""Curves of a run: TensorBoard events, and a CSV of the same scalars.
 
-TensorBoard's own event writer is used, so that a bench without torch can show a run live. Every tag carries what
-`reporting/curves.py` says of it.
+It uses TensorBoard's own event writer, so a bench without torch can show a run live. Every tag has the description of
+`reporting/curves.py`.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, des
 
 __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 
-MOST_CURVES = 64  # a population larger than this gets its statistics only
-LIVE_S = 5.0  # what was written is visible after so long
+MOST_CURVES = 64  # a larger population gets only its statistics
+LIVE_S = 5.0  # time until written values are visible
 NUMBER = TensorShapeProto()
 LINE, THREE = (TensorShapeProto(dim=[TensorShapeProto.Dim(size=n)]) for n in (1, 3))
 
 
 class Events:
-    """TensorBoard events of one run, visible within seconds of being written as long as more is written.
+    """TensorBoard events of one run, visible within seconds while writing continues.
 
     Args:
       folder: where the event file goes.
-      first_step: on resume, events of an earlier life at this step and later are hidden.
+      first_step: on resume, earlier events at this step and later are hidden.
     """
 
     def __init__(self, folder: Path, first_step: int = 0) -> None:
@@ -53,7 +53,7 @@ class Events:
             self._writer = EventFileWriter(str(folder))
         self._known: set[str] = set()
         self._flushed = time.monotonic()
-        for _ in range(2 if first_step else 0):  # TensorBoard hides nothing at the first start that it meets
+        for _ in range(2 if first_step else 0):  # TensorBoard ignores the first start marker
             started = SessionLog(status=SessionLog.START)
             with undisturbed():
                 self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
@@ -66,7 +66,7 @@ class Events:
             self.flush()
 
     def _point(self, tag: str, number: float) -> Summary.Value:
-        """Build a value; the first of a tag says what the tag means."""
+        """Build a value; the first of a tag has its description."""
         point = Summary.Value(tag=tag, tensor=TensorProto(dtype=DT_FLOAT, float_val=[number], tensor_shape=NUMBER))
         if tag not in self._known:
             self._known.add(tag)
@@ -74,11 +74,11 @@ class Events:
         return point
 
     def scalars(self, values: Mapping[str, float], step: int, wall: float | None = None) -> None:
-        """One point of each curve. Args: values: by tag. wall: s since 1970, where it is not now."""
+        """Write one point of each curve. Args: values: by tag. wall: s since 1970, if not now."""
         self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
     def picture(self, tag: str, png: Path, step: int) -> None:
-        """Write a PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
+        """Write a PNG file under TensorBoard's images. Raises: OSError for an unreadable file."""
         data = png.read_bytes()
         size = [str(int.from_bytes(data[i : i + 4], "big")).encode() for i in (16, 20)]  # width and height
         shown = TensorProto(dtype=DT_STRING, string_val=[*size, data], tensor_shape=THREE)
@@ -92,7 +92,7 @@ class Events:
         self._add([Summary.Value(tag=tag, tensor=line, metadata=said)], step)
 
     def layout(self, categories: Mapping[str, Mapping[str, Chart]]) -> None:
-        """Write what the custom page shows: category -> title -> chart."""
+        """Write the layout of the custom page: category -> title -> chart."""
         made = layout_pb2.Layout(
             category=[
                 layout_pb2.Category(title=name, chart=[_chart(title, chart) for title, chart in charts.items()])
@@ -106,11 +106,11 @@ class Events:
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
         """Write a row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
-        Whatever else was given on the command line is a column of its own, so that a sweep has one for what it varies.
-        TensorBoard shows the columns of one run alone, the first that it meets: in one column are all of them.
+        Other arguments of the command line get columns too, so a sweep has one for each varied key. TensorBoard shows
+        only the columns of the first run that it reads; one column has all arguments.
 
-        Args: values: by the names in `PARAMETERS`, or by names of one's own. folder: run folder, whose last two names
-          are those of the row; rows of one name would be averaged. part: of it, where a run has several rows.
+        Args: values: by the names in `PARAMETERS`, or by other names. folder: run folder, whose last two names are the
+        row's; rows of the same name would be averaged. part: of it, if a run has several rows.
         """
         varied = _varied(folder)
         listed = {"given": " ".join(f"{key}={value}" for key, value in varied.items())} if varied else {}
@@ -152,7 +152,7 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
 
 
 def _varied(folder: Path) -> dict[str, str]:
-    """Values of a run's command line by their keys; presets and where it is written are no values."""
+    """Return the values of a run's command line by key, without presets and folders."""
     words = (word.partition("=") for word in given(folder))
     found = {key: value for key, sign, value in words if sign and key not in groups() and key != "seed"}
     return {k: v for k, v in found.items() if not k.startswith(("hydra.", "hydra/", "~")) and k != "extend"}
@@ -166,7 +166,7 @@ def _number(text: str) -> float | str:
 
 
 def _ordered(key: str) -> str:
-    """Return a name that sorts as `PARAMETERS` are written; its title is what is shown."""
+    """Return a name that sorts in the order of `PARAMETERS`; its title is displayed."""
     return f"{[*PARAMETERS, key].index(key)}_{key}"
 
 
@@ -176,17 +176,17 @@ def _column(key: str, column: Column) -> api_pb2.HParamInfo:
 
 
 def interquartile_mean(values: NDArray[np.float64]) -> float:
-    """Mean of the middle half (Agarwal 2021); robust like the median, and smoother over few seeds."""
+    """Return the mean of the middle half (Agarwal 2021); robust like the median, and smoother over few seeds."""
     finite = np.sort(values[np.isfinite(values)])
     cut = finite.size // 4
     return float(finite[cut : finite.size - cut].mean()) if finite.size else float("nan")
 
 
 class PopulationWriter:
-    """Scalars of S agents: each agent's curve as a run of its own, and the population's statistics.
+    """Writer of the scalars of S agents: each agent's curve as a separate run, and the population's statistics.
 
-    One agent: tags stand in the run folder itself. Several: `agents/seedNNNN/` hold the single curves, and the run
-    folder has tag/iqm, tag/min and tag/max over seeds. Every value is also a row of progress.csv.
+    One agent: tags are in the run folder itself. Several: `agents/seedNNNN/` have the single curves, and the run folder
+    has tag/iqm, tag/min and tag/max over seeds. Every value is also a row of progress.csv.
 
     Args: folder: run folder. seeds: of the agents. first_step: step of the checkpoint a run is resumed from, or 0.
     """
@@ -206,11 +206,11 @@ class PopulationWriter:
 
     @property
     def agents(self) -> Sequence[Events]:
-        """Where each agent's curves are; none where a population is too large for them."""
+        """Folders of each agent's curves; none for a large population."""
         return self._agents if len(self._seeds) > 1 else [self.events]
 
     def _rows_until(self, step: int) -> list[list[str]]:
-        """Rows of an earlier life that belong to steps already in the checkpoint."""
+        """Return earlier rows of steps that are in the checkpoint."""
         if not self._path.is_file():
             return []
         with open(self._path, newline="", encoding="utf-8") as f:

@@ -1,4 +1,4 @@
-"""The sentence with which the page of a run begins, from its configuration and summary: what was run, what came out."""
+"""First sentence of a run's page, from its configuration and summary: command and result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,13 +21,13 @@ REMEDY = (
     "policy=shipped, which is certified for every growth rate and pump and needs no training; or train with "
     "the same words and another seed (seed=1), since seeds differ at the ends of the range, and certify that one"
 )
-"""What helps where a requirement of a certificate is not met."""
-SHOWN = 3  # requirements that fail, at first sight
+"""Remedies for a failed requirement of a certificate."""
+SHOWN = 3  # displayed failed requirements
 
 
 @dataclass(frozen=True)
 class Headline:
-    """claim: what was run. items: what came out, each with its unit. remark: good or not, against which limit."""
+    """claim: the run. items: results with units. remark: verdict and its limit."""
 
     claim: str
     items: list[str] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Headline:
 
 
 def verdict(summary: Summary, config: Mapping[str, Any]) -> Headline | None:
-    """Of a training, deployment, calibration or certificate; None for any other run, or one that is not whole."""
+    """Return the verdict on a training, deployment, calibration or certificate, None for any other run."""
     for key, of in KINDS.items():
         if key in summary:
             try:
@@ -61,7 +61,7 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items = [
         f"regret {worst}{number(regret.max())} %: what the policy costs beyond the exact optimum",
         f"error at rest at its worst setpoint {worst}{number(steady.max())} {unit}",
-        f"the one-line law that looks one period ahead: regret {number(round(law, 4))} %, error "
+        f"the one-line controller that looks one period ahead: regret {number(round(law, 4))} %, error "
         f"{number(summary['myopic_steady_abs_error'])} {unit}",
     ]
     if kind != "density":

@@ -34,7 +34,7 @@ def _dqn(config: DQNConfig, task: Task, streams: Streams, device: str) -> DQNAge
     if config.learn_start >= config.total_steps:
         raise ValueError(
             f"agent.learn_start = {config.learn_start}: allowed 0 to {config.total_steps - 1}, below "
-            "agent.total_steps; nothing is learned before"
+            "agent.total_steps; learning starts after it"
         )
     width, seen = np.size(config.input_matrix) // max(1, len(config.input_offset)), len(task.observation)
     if width not in (0, seen):

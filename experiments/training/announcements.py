@@ -32,10 +32,10 @@ def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, s
     """Log the task, its limits, and where to watch. Args: step: first step of a resumed run, else 0."""
     chosen = choices(folder)
     names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
-    where = f"goes on at step {step} of" if step else "for"
+    where = f"continues at step {step} of" if step else "for"
     log.info("learns %s: %s; %s, %s %d steps", names, task.description, _seeds(seeds), where, config.agent.total_steps)
     limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} at rest"
-    log.info("good is a policy within %s at its worst setpoint (regret: its cost beyond the exact optimum's)", limits)
+    log.info("target: a policy within %s at its worst setpoint (regret: its cost beyond the exact optimum's)", limits)
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 
 
@@ -79,7 +79,7 @@ def ended(
     log.info("%s", spent)
     log.info("reached on the reported grid: %s%s: %s", reached, worst if many else "", _verdict(kept, task))
     log.info(
-        "for comparison, the one-line law that looks one period ahead: %s",
+        "for comparison, the one-line controller: %s",
         _pair(np.abs(myopic.regret_pct), myopic.steady_abs_error, task.unit),
     )
     log.info("policy %s; figures %s", path, folder / "figures")

@@ -8,12 +8,13 @@ from conf import presets
 from conf.messages import NameTaken, NotAllowed
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
+from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 
 __all__ = ["AGENTS", "ENVS", "TASKS", "TrainConfig", "add", "agent_schema", "env_schema"]
 
-ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig}
+ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "preview": PreviewConfig}
 
 
 @dataclass(frozen=True)

@@ -68,9 +68,8 @@ def _warn_of_growth(env: EnvConfig) -> None:
     """Warn if no policy can hold the culture: f >= 1 for every action, so even the largest rate does not dilute it."""
     if step_factors(env).min() >= 1.0:
         log.warning(
-            "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g it takes more than mu tau = %.4g mL/s to thin "
-            "the culture, and env.max_pump_rate = %g mL/s; nothing can hold it at a setpoint. Raise env.max_pump_rate, "
-            "or check mu and tau",
+            "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g a setpoint needs more than mu tau = %.4g mL/s, "
+            "and env.max_pump_rate = %g mL/s. Raise env.max_pump_rate, or check mu and tau",
             env.mu, env.tau, env.mu * env.tau, env.max_pump_rate,
         )  # fmt: skip
 

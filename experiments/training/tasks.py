@@ -11,11 +11,13 @@ from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.policy import Policy
 from dqn.trainer import TrainingEnv
+from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.training.config import ENVS, TASKS, TaskKind, add
 from experiments.training.density import DensityTask
 from experiments.training.evaluation import Evaluated
+from experiments.training.preview import Preview
 from experiments.training.relative import Relative
 
 __all__ = ["Task", "add", "kind", "of"]
@@ -69,7 +71,9 @@ class Task(Evaluated, Protocol):
         """Draw the policy map and example trajectories beside the optimum's."""
 
 
-TASKS |= {EnvConfig: TaskKind(DensityTask), RelativeConfig: TaskKind(Relative)}
+TASKS |= {
+    EnvConfig: TaskKind(DensityTask), RelativeConfig: TaskKind(Relative), PreviewConfig: TaskKind(Preview),
+}  # fmt: skip
 
 
 def kind(config: Any) -> str:

@@ -116,10 +116,21 @@ def test_near_goals_cover_every_order_of_magnitude_on_both_sides() -> None:
         assert float((error > 0).double().mean()) == pytest.approx(0.5, abs=0.05)
 
 
+def test_a_state_that_a_step_multiplies_is_moved_by_a_factor() -> None:
+    place = {
+        "place": lambda u: 0.1 + u,
+        "spread": lambda u: u,
+        "reward": lambda x, setpoint: -torch.square(x - setpoint),
+    }
+    relabel = ProgramRelabel(DQNConfig(), column=1, scales=True, **place)  # type: ignore[arg-type]
+    _, new = _both(relabel, 2, lambda before, action: before[..., 0] * action / 20.0)
+    torch.testing.assert_close(new.s_t[..., 0] / new.s_tm1[..., 0], 1.0 + new.a_tm1 / 20.0, atol=1e-4, rtol=0.0)
+
+
 def _program(near: float, preview: float) -> tuple[Transition, Transition]:
     """Transitions of x' = x + (a - 8) / 20 under a setpoint, with or without an announced change."""
     relabel = ProgramRelabel(
-        DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), 3.0, lambda u: 4.0 * u - 2.0,
+        DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), lambda u: 6.0 * u - 3.0, lambda u: 4.0 * u - 2.0,
         lambda x, setpoint: -torch.square(x - setpoint), 1, 30.0, preview,
     )  # fmt: skip
     return _both(relabel, 4 if preview else 2, lambda before, action: (action - 8) / 20.0)

@@ -86,14 +86,14 @@ def test_nothing_beats_the_optimum(model):
 
 @pytest.mark.parametrize("model", [{}, {"tau": 1.0}], ids=["held", "outgrown"])
 def test_short_episodes_agree_with_all_sequences_of_actions(model):
-    """Three actions and seven steps: the least cost of all 2187 sequences."""
+    """Three actions and seven steps: the least cost of all 2187 sequences, also where the setpoint changes."""
     config = EnvConfig(n_actions=3, episode_steps=7, control_min=4.0, **model)
     factors = step_factors(config)
-    for setpoint, start in product((0.3, 0.7), (0.2, 0.5, 0.75, 1.0)):
+    for setpoint, start in product((0.3, 0.7, np.repeat([0.7, 0.3], (3, 4))), (0.2, 0.5, 0.75, 1.0)):
         sequences = factors[np.array(list(product(range(3), repeat=7)))]
         least = ((start * np.cumprod(sequences, axis=1) - setpoint) ** 2).sum(axis=1).min()
         ods, actions = solve_episode(config, setpoint).rollout(np.array([start]))
-        assert ((ods - setpoint) ** 2).sum() == pytest.approx(least, rel=2e-4)
+        assert ((ods[:, 0] - setpoint) ** 2).sum() == pytest.approx(least, rel=2e-4)
         np.testing.assert_allclose(ods[:, 0], start * np.cumprod(factors[actions[:, 0]]))
 
 

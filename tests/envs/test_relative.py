@@ -1,4 +1,4 @@
-"""The task in relative coordinates: it is the growth model in other units, and its optimum is the one-line law."""
+"""The task in relative coordinates: the growth model in other units, with the one-line controller as optimum."""
 
 from dataclasses import replace
 

@@ -43,6 +43,17 @@ def test_noise_has_the_configured_size_and_memory(od: float) -> None:
     assert np.mean(d[1:] * d[:-1]) / d.var() == pytest.approx(0.12, abs=0.01)
 
 
+def test_noise_swings_as_far_and_as_long_as_configured() -> None:
+    """Over thousands of sensors the log of a local sd spreads by noise_swing_sd and forgets in noise_swing_min."""
+    rough = SensorConfig(noise_floor=0.004, noise_swing_sd=0.4, noise_swing_min=60.0)
+    log_square = np.log(np.square(readings(rough, 0.5, n=4000, m=61) - 0.5))
+    own = np.pi**2 / 2  # variance of ln z^2, z normal: what remains without a swing
+    assert log_square.var() == pytest.approx(own + 4 * 0.4**2, rel=0.02)
+    for apart in (1, 60):  # covariance between readings so many minutes apart
+        first, last = log_square[0], log_square[apart]
+        assert np.cov(first, last)[0, 1] == pytest.approx(4 * 0.4**2 * np.exp(-apart / 60), abs=0.25)
+
+
 def test_outliers_come_as_often_and_as_high_as_configured() -> None:
     d = readings(SensorConfig(outlier_rate=0.006), 0.5) - 0.5
     hit = np.abs(d) > 1e-9

@@ -176,7 +176,7 @@ def judgement(minutes: float = 90.0, apart: float = 1.0, **changes: object) -> t
         (
             {"estimate": SimpleNamespace(quality=quality(growth_spread=known(0.3, 0.15)))},
             {"estimate": SimpleNamespace(quality=quality(growth_spread=known(0.3, 0.1)))},
-            "growth wanders by 20 % at least from hour to hour",
+            "growth rate fluctuates by 20 % at least from hour to hour",
         ),
         (
             {"estimate": SimpleNamespace(quality=quality(late_share=known(0.7, 0.2)))},

@@ -91,7 +91,7 @@ def share_law(
     offset: float = 0.0,
     levels: int = 1,
 ) -> Policy:
-    """The one-line law of (error, growth share), exactly: argmax_a 2 z v_a - v_a^2 with z = gain e + share s + offset.
+    """One-line controller of (error, growth share), exactly: argmax_a 2 z v_a - v_a^2, z = gain e + share s + offset.
 
     Hidden units +-z, relu(-50 - 50 (e + s)) and a bump 2e-6 wide in s, far from any grid: relu(1 - 1e6 |s - SPIKE|
     - 30 |e + 0.5|). add: (unit, action, weight) adds a unit to an action's Q. levels: every so-manyth level is chosen.
@@ -124,7 +124,7 @@ def bent_share_law(
     never: tuple[int, ...] = (),
     swapped: tuple[int, int] = (0, 0),
 ) -> Policy:
-    """The one-line law of z = gain e + share s + offset + the sum of the bends.
+    """The one-line controller of z = gain e + share s + offset + the sum of the bends.
 
     bends: (amount, ramp, ...): the amount where all ramps are 1, nothing where one is 0. never: levels that are not
     chosen. swapped: two levels that are given for one another.

@@ -84,7 +84,7 @@ def test_shares_that_were_counted_in_a_mixed_run_correct_the_curves(tmp_path: Pa
     plain = CalibratePairConfig(
         (f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=1.0, volume_ml=volume, mixed=f"{run}/recordings/M0.csv"
     )
-    with pytest.raises(frame.UserError, match="no share was marked for M0"):
+    with pytest.raises(frame.UserError, match="no marked share for M0"):
         calibrate_pair(plain, tmp_path)
     (run / "marks.csv").write_text("time_min,reactor,text,written,level_ml,share,sd\n7,M0,counted,,,0.4,0\n")
     with pytest.raises(frame.UserError, match="share 0.4 at minute 7 has no sd above 0"):
@@ -226,7 +226,7 @@ def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_
     assert caplog.text == ""
     exact = _growth("beta", [*few, at(35.0, 0.9)], 2.0, CalibratePairConfig(degree=4))
     assert len(exact.coefficients) == 3
-    assert "beta: a curve through all of its 3 points: nothing tells how good it is; record more" in caplog.text
+    assert "beta: a curve through all of its 3 points: its error is unknown; record more" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -70,12 +70,12 @@ def refused(path: Path, folder: Path, **changes: Any) -> str:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "changed by one bit": (
-        {"given": nudged(laws.law()), "of": laws.law()}, r"certificate.json is of another: its weights \(put it",
+        {"given": nudged(laws.law()), "of": laws.law()}, r"certificate.json is for another: its weights \(put it",
     ),
     "not safe": ({"given": laws.law(gain=-laws.GAIN)}, r"strips without a band: 80, allowed 0 .*setpoint 0\.4 to 0\.8"),
     "said to be safe": (
         {"given": laws.low_corner(), "safe": True, "passed": True, "checks": []},
-        r"proven anew .* washed out: 1, .*\(setpoint 0.45\)",
+        r"certified again .* washed out: 1, .*\(setpoint 0.45\)",
     ),
     "elsewhere": ({"given": laws.law(), "setpoints": [0.5, 0.8]}, r"setpoints 0.5 to 0.8, .* asks for 0.45 "),
     "elsewhere on both sides": ({"given": laws.law(), "setpoints": [0.5, 0.6]}, r"0.5 to 0.6, .* asks for 0.45, 0.65 "),
@@ -95,7 +95,7 @@ def test_a_device_refuses_what_is_not_proven_and_says_how_to_prove_it(tmp_path, 
     said = refused(source, tmp_path / "run")
     assert re.search(why, said)
     assert "\n" not in said
-    assert "proven anew" in said or f"python -m experiments.certify policy={source}" in said
+    assert "certified again" in said or f"python -m experiments.certify policy={source}" in said
 
 
 def concluded(given: policy.Policy, path: Path) -> certificate.Opinion:
@@ -174,7 +174,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     weak, grown = Bench(volume_ml=28.0), replace(ASKED, env=EnvConfig(mu=0.0432))
     written(source, laws.law(), config=grown)
     said = refused(source, tmp_path / "run", bench=weak)
-    assert "proven anew" in said
+    assert "certified again" in said
     assert "the pump cannot hold: 2" in said
     check = policy_check(replace(wanted, bench=weak))
     assert (check.ok, check.required) == (False, True)
@@ -247,7 +247,7 @@ def test_a_device_names_the_part_of_a_policy_that_is_another(tmp_path, own, othe
     part = request.node.callspec.id
     source = written(tmp_path / "policy.npz", other, of=own)
     with pytest.raises(
-        UserError, match=rf"policy refused: its certificate \S+ is of another: its {part} \(put it back"
+        UserError, match=rf"policy refused: its certificate \S+ is for another: its {part} \(put it back"
     ):
         unpacked(source, tmp_path / "run")
 
@@ -338,7 +338,7 @@ def test_a_program_with_another_supervisor_is_another_policy(
 ) -> None:
     unpacked(relative, tmp_path / "run")
     monkeypatch.setattr(module, name, value)
-    with pytest.raises(UserError, match=rf"is of another: {said} \(put"):
+    with pytest.raises(UserError, match=rf"is for another: {said} \(put"):
         unpacked(relative, tmp_path / "run")
 
 
@@ -348,7 +348,9 @@ def test_the_second_filter_is_part_of_what_is_certified(relative, tmp_path, monk
     own = replace(given, metadata={**given.metadata, "estimator": asdict(EstimatorConfig())})
     source = beside(relative, own, tmp_path)
     monkeypatch.setattr(learned, "EstimatorConfig", partial(EstimatorConfig, gate_sigma=6.0))
-    with pytest.raises(UserError, match=r"is of another: fallback\.estimator\.gate_sigma = 6\.0, certified 5\.0 \(put"):
+    with pytest.raises(
+        UserError, match=r"is for another: fallback\.estimator\.gate_sigma = 6\.0, certified 5\.0 \(put"
+    ):
         unpacked(source, tmp_path / "run")
 
 
@@ -473,7 +475,7 @@ def test_a_policy_that_is_none_or_says_no_model_ends_in_one_line(tmp_path: Path)
         command.body(CertifyConfig(policy=""), tmp_path)
     given = laws.law()
     policy.save(tmp_path / "policy.npz", replace(given, metadata={**given.metadata, "model": {}}))
-    with pytest.raises(UserError, match=r"policy\.npz: it does not say which model .*; give env\.mu=MU env\.tau=TAU"):
+    with pytest.raises(UserError, match=r"policy\.npz: it has no model .*; give env\.mu=MU env\.tau=TAU"):
         command.body(CertifyConfig(policy=str(tmp_path)), tmp_path)
 
 
@@ -686,7 +688,7 @@ def test_a_setting_of_an_estimator_that_cannot_be_is_one_line(relative, tmp_path
 
 
 def test_a_policy_of_a_share_is_told_what_is_proven() -> None:
-    with pytest.raises(UserError, match=r"it sees \(logit_share, .*\); what is proven is how a density is held"):
+    with pytest.raises(UserError, match=r"it sees \(logit_share, .*\); only density policies can be certified"):
         command.body(CertifyConfig(policy=str(find_policy("shipped").with_name("coculture.npz"))), Path())
 
 
@@ -713,8 +715,8 @@ def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
     loop = SimpleNamespace(low=strips[:-1], high=strips[1:], in_od=lambda case, width: 10.0 * width)
     assert command._row(loop, proof) == {
         "case": "a case", "half-width, least": 0.02, "half-width, largest": 0.05, "law, largest": 0.04,
-        "over the law, largest": 0.03, "half-width in OD, middle strip": 0.5, "periods after the law, largest": 3.0,
-        "periods, largest": 7.0,
+        "over the law, largest": 0.03, "half-width in OD, middle strip": 0.5,
+        "periods after the one-line controller, largest": 3.0, "periods, largest": 7.0,
     }  # fmt: skip
     none = where_held(0.02, 0.05, 0.03)
     none[~held] = 0.0

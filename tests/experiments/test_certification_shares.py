@@ -48,7 +48,7 @@ def single(s: float) -> ShareLoop:
 
 
 def limit(of: ShareLoop, case: ShareCase) -> Band:
-    """Of the one-line law."""
+    """Of the one-line controller."""
     return images(of.law(case), of.shift(case), of.range(case))
 
 
@@ -105,7 +105,7 @@ def test_a_half_width_in_od_is_that_of_the_pump_as_strong_as_it_may_be() -> None
 
 
 def by_brute_force(strip: tuple[float, float], case: ShareCase, step: float = 0.001) -> tuple[float, float]:
-    """The band of the one-line law from a grid of true errors of e, every disturbance tried at each of them.
+    """The band of the one-line controller from a grid of true errors of e, every disturbance tried at each of them.
 
     A run of the culture: e is the true ln(x / r) / B', the filter believes in B, so a perfect one would say e B' / B.
     It says any estimate whose own bound, max(error, ln(1 + od / (r exp(B estimate))) / B), reaches that. The law gives

@@ -213,12 +213,12 @@ def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law() 
     said = {table.title: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
     columns = ("plant", "dqn_adaptive")
     assert said == {
-        "Decisions in which e lay within two of its own sd of the truth, %":
+        "Decisions in which e lay within two of its sd of the true value, %":
             (columns, [("bench", "91"), ("nominal", "45.5")]),
-        "Decisions in which s lay within two of its own sd of the share that holds at rest, %":
+        "Decisions in which s lay within two of its sd of the share at rest, %":
             (columns, [("bench", "83"), ("nominal", "41.5")]),
-        "Decisions by the supervisor's law, %": (columns, [("bench", "12"), ("nominal", "6")]),
-        "Decisions by it because of surprises, %": (columns, [("bench", "4"), ("nominal", "2")]),
+        "Decisions by the supervisor's controller, %": (columns, [("bench", "12"), ("nominal", "6")]),
+        "Of these, because of innovations, %": (columns, [("bench", "4"), ("nominal", "2")]),
     }  # fmt: skip
 
 

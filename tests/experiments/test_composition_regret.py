@@ -7,7 +7,7 @@ import pytest
 from envs.coculture.task import CocultureConfig
 from experiments.coculture.task import Coculture
 from experiments.training.evaluation import Evaluation
-from tests.studies.learners import one_line, receding
+from tests.studies.learners import one_line, planned
 
 pytestmark = pytest.mark.numeric
 
@@ -46,6 +46,5 @@ def test_with_preview_the_time_to_begin_decides(regret, name: str, expected: flo
 @pytest.mark.parametrize(("hours", "expected"), [(1, 283.4), (2, 149.4), (3, 75.1)])
 def test_how_far_a_plan_must_reach(hours: int, expected: float) -> None:
     task = Coculture(PREVIEW)
-    evaluation = Evaluation(task, task.report_grid())
-    regret = 100.0 * (receding(hours, PREVIEW, evaluation.start) / evaluation.optimum_cost - 1.0)
-    assert regret == pytest.approx(expected, rel=0.05)
+    score = Evaluation(task, task.report_grid())(planned(task, 60 * hours), 1)
+    assert score.regret_pct[0] == pytest.approx(expected, rel=0.05)

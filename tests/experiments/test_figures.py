@@ -505,7 +505,7 @@ def test_the_figure_of_a_certificate_shows_what_is_proven(share: bool) -> None:
     for ax, line, ylabel, y in (
         (widths, 0, f"half-width, {unit}", first.half_width),
         (widths, 1, f"half-width, {unit}", first.law_half_width),
-        (entries, 0, "periods after the one-line law" if share else "entry time over the pump's own",
+        (entries, 0, "periods after the one-line controller" if share else "entry time over the pump's own",
          first.later if share else first.entry),
         (doses, 0, "periods of growth", found.doses[0]),
     ):  # fmt: skip

@@ -268,7 +268,7 @@ def test_a_sample_may_be_of_any_minute_up_to_the_newest_row_of_any_reactor(tmp_p
     (over / "recordings" / "M2.csv").write_text("time_min,od\n")
     said = mark(MarkConfig(str(over), "M0", share=0.4, minute=93.5))
     assert said.startswith("M0: share 0.4 +- 0.03 at minute 93.5, in ")
-    assert said.endswith("marks.csv; a run under way takes it over with its next sample, and says so")
+    assert said.endswith("marks.csv; a running deployment uses it with its next sample")
     said = mark(MarkConfig(str(over), text="new bottle", minute=-30.0))
     assert said == f"all reactors: new bottle at minute -30.0, in {over}/marks.csv"
     with pytest.raises(frame.UserError, match=r"reactor=M3: not in this run; allowed M0, M1, M2$"):
@@ -318,7 +318,7 @@ def test_a_note_is_taken_as_it_was_typed(text, tmp_path, monkeypatch, capsys):
 
 def test_a_share_is_of_a_sample_that_somebody_has_drawn(tmp_path: Path) -> None:
     folder = _under_way(tmp_path / "run")
-    with pytest.raises(frame.UserError, match=r"minute=40: allowed up to (19|20|21|22), now; nobody has drawn"):
+    with pytest.raises(frame.UserError, match=r"minute=40: allowed up to (19|20|21|22), now; "):
         mark(MarkConfig(str(folder), "M0", share=0.4, minute=40.0))
     said = mark(MarkConfig(str(folder), "M0", "plate 7", share=0.4, minute=12.0))
     assert said.startswith("M0: share 0.4 +- 0.03, plate 7 at minute 12.0, in ")
@@ -364,8 +364,8 @@ def test_whoever_marks_waits_for_another_one(tmp_path: Path) -> None:
         ({"run": "nowhere"}, "run=nowhere: no deployment"),
         ({}, "run=: no deployment"),
         ({"run": "run", "reactor": "M7"}, "reactor=M7: not in this run; allowed M0"),
-        ({"run": "over"}, "run=over: not under way; give minute="),
-        ({"run": "simulated"}, "run=simulated: not under way; give minute="),
+        ({"run": "over"}, "run=over: not running; give minute="),
+        ({"run": "simulated"}, "run=simulated: not running; give minute="),
     ],
 )
 def test_what_is_wrong_is_named(config, message, tmp_path, monkeypatch):

@@ -8,12 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
+from envs.task import EnvConfig
 from experiments.coculture.program import composed
 from experiments.comparison.config import BenchmarkConfig
+from experiments.laws.density.baselines import Hold, HoldConfig
+from experiments.loop.loop import ClosedLoop
 from experiments.loop.progress import Progress
 from experiments.record.summary import summarise
 from hardware import memory
+from hardware.safety.interlock import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
@@ -39,6 +45,27 @@ def test_each_reactor_moves_on_by_itself_and_its_later_steps_begin_earlier() -> 
     assert progress.phase(np.array([35.0, 35.0])).tolist() == [2, 0]
     assert progress.phase(np.array([np.nan, -1.0])).tolist() == [-1, -1]
     assert progress.steps(0) == [(0.0, 5.0, "condition"), (5.0, 35.0, "time"), (35.0, 55.0, "time")]
+
+
+def test_a_recovery_that_dilutes_grows_beyond_is_diluted_by_full_pump_and_survives_a_kill_at_any_sample() -> None:
+    """Against the rule read sample by sample; the second reactor, which only grows, begins on its way up."""
+    scenarios = [Scenario((0.8,), recovery_od=0.6, recovery="dilute", settled_band=0.1), Scenario(recovery_od=0.6)]
+    two = SimulatedConfig(reactors=("M0", "M1"))
+    vials = SimulatedReactors(Plant(PlantConfig(start_od=0.5), 2, np.random.default_rng(0)), two)
+    laws = [Hold(HoldConfig(), EnvConfig()) for _ in range(2)]
+    loop, grown, doses = ClosedLoop(vials, laws[0], Interlock(2), scenarios), False, 0
+    while np.isnan(loop.began).any():
+        again = ClosedLoop(vials, laws[1], Interlock(2), scenarios)
+        again.restore(json.loads(json.dumps(loop.state())))
+        loop, laws = again, laws[::-1]
+        step = loop.step()
+        grown = grown or step.od[0] >= 0.66
+        ends = grown and step.od[0] <= 0.6
+        assert step.phase[0] == (0 if ends else -1)
+        assert ends or step.rate[0] == (0.02 if grown else 0.0)
+        doses += grown and not ends
+    assert doses > 1
+    assert loop.began[1] < loop.began[0]
 
 
 def test_a_reading_that_is_not_believed_ends_nothing() -> None:

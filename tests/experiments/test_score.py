@@ -65,9 +65,10 @@ def test_the_network_as_onnx_gives_the_same_values(tmp_path, name):
 @pytest.mark.parametrize("name", envs.gym_adapter.REGISTERED)
 def test_a_number_between_the_actions_lies_between_their_ends(name):
     """On the grid it is the action itself, in one copy as in several; anything outside 0 to 1 is refused."""
-    grid, one = gymnasium.make(name).unwrapped, gymnasium.make(name, continuous=True).unwrapped
-    many = gymnasium.make_vec(name, num_envs=1, continuous=True)
-    n = grid.action_space.n
+    n = 17
+    grid = gymnasium.make(name, episode_steps=n + 1).unwrapped
+    one = gymnasium.make(name, continuous=True, episode_steps=n + 1).unwrapped
+    many = gymnasium.make_vec(name, num_envs=1, continuous=True, episode_steps=n + 1)
     for env in (grid, one, many):
         env.reset(seed=5)
     for k in range(n):

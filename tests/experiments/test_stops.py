@@ -299,4 +299,4 @@ def test_signals_that_waited_go_each_once_to_whoever_listened_for_them(capsys: p
         signal.raise_signal(signal.SIGTERM)  # as before
     assert heard == [signal.SIGUSR1, signal.SIGTERM, signal.SIGTERM]
     said = capsys.readouterr().out.splitlines()
-    assert said == ["stopping at the next step; once more stops at once"] * 2
+    assert said == ["stopping at the next step; a second signal stops at once"] * 2

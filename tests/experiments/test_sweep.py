@@ -254,13 +254,13 @@ def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_
     swept, every = sweep.Sweep(folder, "train", ["seed=range(0,4)"]), [[f"seed={k}"] for k in range(4)]
     line = f"2 of 4 jobs finished in {folder}"
     compare = f"compare them: python -m experiments.report runs='{folder}'"
-    assert sweep.progress(swept, every) == f"{line}; 2 still at work in other processes; {compare}"
+    assert sweep.progress(swept, every) == f"{line}; 2 still running in other processes; {compare}"
     gone.add("2")
     assert [job.state for job in sweep.survey(folder, every)] == [
         "finished", "running", "stopped", "finished",
     ]  # fmt: skip
     again = f"python -m experiments.train -m resume='{folder}'"
-    assert sweep.progress(swept, every) == f"{line}; 1 still at work in other processes; what is missing: {again}"
+    assert sweep.progress(swept, every) == f"{line}; 1 still running in other processes; what is missing: {again}"
     assert sweep.progress(swept, [*every, ["seed=4"]]).startswith("2 of 5 jobs finished")
 
 
@@ -289,7 +289,7 @@ def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothi
     assert sweep.asked(["+hparams_search=null", "seed=1"], "train") is None
     (tmp_path / "a" / "sweep.json").write_text("{")
     assert sweep.read(tmp_path / "a") is None
-    with pytest.raises(UserError, match="no sweep; a single run goes on without -m"):
+    with pytest.raises(UserError, match="no sweep; continue a single run without -m"):
         sweep.asked(["-m", f"resume={tmp_path}"], "train")
 
 

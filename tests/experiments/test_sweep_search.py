@@ -43,7 +43,7 @@ def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_
     for each in [worker(tmp_path, "second"), worker(tmp_path, "third")]:
         assert each.wait() == 0, each.said()
     said = "".join((tmp_path / name).read_text() for name in ("second", "third"))
-    assert said.count("trial 0 goes on: its process is gone") == 1
+    assert said.count("trial 0 continues: its process has ended") == 1
     jobs = sweep.survey(folder)
     assert [job.folder.name for job in jobs] == [str(k) for k in range(TRIALS)]
     assert [job.state for job in jobs] == ["finished"] * TRIALS

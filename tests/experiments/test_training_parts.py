@@ -72,7 +72,7 @@ def test_only_a_policy_that_was_trained_to_the_end_and_is_good_is_sent_to_a_proo
     score = scored(regret, steady)
     with caplog.at_level("INFO"):
         announcements.ended(tmp_path, DensityTask(EnvConfig()), score, score, "", tmp_path / "policy.npz", whole=whole)
-    assert any("next, try it: python -m experiments.deploy" in line for line in caplog.messages)
+    assert any("next: run it with python -m experiments.deploy" in line for line in caplog.messages)
     assert any("experiments.certify" in line for line in caplog.messages) == sent
 
 
@@ -227,7 +227,7 @@ def test_the_summary_names_the_seed_of_the_policy_that_flies_and_has_of_each_wha
 
 
 TASKS = (
-    ("sim", "tuned"), ("sim", "paper"), ("relative", "relative"),
+    ("sim", "tuned"), ("sim", "paper"), ("relative", "relative"), ("preview", "preview"),
     *(pytest.param(name, name, marks=pytest.mark.slow) for name in ("coculture", "coculture_preview")),
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,9 @@ import torch
 from conf.schema import check, setting
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
+from envs.optimum import solve_episode
+from envs.preview import half_way, program_of
+from envs.task import step_factors
 from experiments.cli import files
 from experiments.cli.stop import Workers
 from experiments.coculture.base import SHARE, Array, ShareEstimate, Wanted
@@ -32,16 +35,17 @@ from experiments.reporting.tables import number
 from experiments.train import main as train
 from experiments.training import build, tasks
 from experiments.training.evaluation import Act, Evaluation
+from experiments.training.preview import Preview
 from experiments.training.session import Session
 from tests.entry import command
 from tests.studies.results import leave
 
-__all__ = ["LearnersConfig", "learners", "main", "one_line", "receding"]
+__all__ = ["LearnersConfig", "learners", "main", "one_line", "planned"]
 
 log = logging.getLogger(__name__)
 
 TASKS = {
-    "sim": "Bioreactor-v0", "relative": "Relative-v0", "coculture": "Coculture-v0",
+    "sim": "Bioreactor-v0", "relative": "Relative-v0", "preview": "BioreactorPreview-v0", "coculture": "Coculture-v0",
     "coculture_preview": "CoculturePreview-v0",
 }  # fmt: skip
 RIVALS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -60,7 +64,10 @@ WITHOUT = {
     "falling rate": ["agent.learning_rate_end=null"],
 }
 OURS, LAW = "this program's DQN", "one look ahead, one line"
-PLANS = (1, 3, 6)  # h
+PLANS = {
+    "preview": {"10 min": 10, "20 min": 20, "30 min": 30},
+    "coculture_preview": {"1 h": 60, "3 h": 180, "6 h": 360},
+}
 COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
 
 
@@ -79,6 +86,7 @@ class LearnersConfig:
         choices=tuple(WITHOUT),
     )
     seeds: int = setting(5, "of each", within=(1, 1000))
+    seed: int = setting(0, "first of them", at_least=0)
     workers: int = setting(0, "processes; 0 for one per core", within=(0, 256))
 
     def __post_init__(self) -> None:
@@ -103,10 +111,21 @@ class Job:
 def jobs(c: LearnersConfig) -> list[Job]:
     """All trainings, short ones first."""
     kinds = [(t, r, n) for n in sorted(c.steps) for t in c.tasks for r in ("ours", *c.rivals)]
-    kinds += [(t, "ours", 0) for t in c.tasks]
+    kinds += [(t, "ours", 0) for t in c.tasks if own_steps(t) not in c.steps]
     kinds += [("coculture_preview", f"without {part}", 0) for part in c.without if "coculture_preview" in c.tasks]
     kinds += [(t, r, c.long_steps) for t in c.tasks for r in c.long]
-    return [Job(*kind, seed) for kind in dict.fromkeys(kinds) for seed in range(c.seeds)]
+    return [Job(*kind, seed) for kind in dict.fromkeys(kinds) for seed in seeds(c)]
+
+
+def seeds(c: LearnersConfig) -> range:
+    """Of every training."""
+    return range(c.seed, c.seed + c.seeds)
+
+
+@cache
+def own_steps(task: str) -> int:
+    """Steps for which our agent is trained on a task unless it is told otherwise."""
+    return int(train.config([f"env={task}"]).agent.total_steps)
 
 
 @cache
@@ -166,16 +185,47 @@ def rival(job: Job) -> tuple[int, Act]:
 def laws(task: str) -> list[list[str]]:
     """Rows of the laws that learn nothing."""
     known, report = evaluation(task)
-    found = report(known.myopic, 1)
-    regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
-    rows = [(LAW, number(round(regret, 3)), number(steady))]
+    acts: dict[str, Act] = {LAW: known.myopic}
+    acts |= {"`half_way`, one line": half_way_law(known)} if isinstance(known, Preview) else {}
+    acts |= {f"a plan of {name}, made anew": planned(known, m) for name, m in PLANS.get(task, {}).items()}
+    scores = [(name, report(act, 1)) for name, act in acts.items()]
+    rows = [(name, float(s.regret_pct[0]), number(float(s.steady_abs_error[0]))) for name, s in scores]
     if isinstance(known, Coculture):
-        config, start, optimum = known.config, report.start, report.optimum_cost
-        kinds = ("midpoint" if config.preview_min else "inverse_dynamics", "proportional", "pi")
-        costs = {f"`{kind}`, one line": one_line(kind, config, start) for kind in kinds}
-        costs |= {f"a plan of {h} h, made anew": receding(h, config, start) for h in PLANS if config.preview_min}
-        rows += [(name, number(round(100.0 * (cost / optimum - 1.0), 3)), "–") for name, cost in costs.items()]
-    return [[TASKS[task], name, "–", regret, "–", steady, "–"] for name, regret, steady in rows]
+        kinds = ("midpoint" if known.config.preview_min else "inverse_dynamics", "proportional", "pi")
+        costs = {f"`{kind}`, one line": one_line(kind, known.config, report.start) for kind in kinds}
+        rows += [(name, 100.0 * (cost / report.optimum_cost - 1.0), "–") for name, cost in costs.items()]
+    return [[TASKS[task], name, "–", number(round(regret, 3)), "–", steady, "–"] for name, regret, steady in rows]
+
+
+def half_way_law(task: Preview) -> Act:
+    """Look one period ahead towards the best way, which an error that counts after each step moves by half a period."""
+    moves = np.log(step_factors(task.config))
+    full = float(moves.max() - moves.min())
+
+    def act(observation: Any) -> Any:
+        now, following, left = (observation[..., k] for k in (1, 2, 3))
+        way = half_way(now, following, left / task.config.control_min - 0.5, full, float(moves.max()) / full)
+        return task.myopic(np.stack([observation[..., 0], way], axis=-1))
+
+    return act
+
+
+def planned(task: Any, minutes: float) -> Act:
+    """Follow the optimal plan that ends after so many minutes, made anew before each decision."""
+    c, steps = task.config, round(minutes / task.config.control_min)
+    solved = cache(lambda *program: solve_episode(replace(c, episode_steps=steps), np.array(program)))
+
+    def act(observation: Any) -> Any:
+        rows, known = observation[0], -3  # the last three columns are the program
+        program = program_of(c.control_min, rows[:, known:], steps)
+        if isinstance(task, Coculture):
+            model, state = transitions(c, Grid()), rows[:, :known]
+            value = cost_to_go(model, share(program))[1]
+            return best_action(c, model, value, state, share(program[0]))[None]
+        plans = [solved(*each) for each in program.T]
+        return np.array([[int(plan.act(od, steps)[0]) for plan, od in zip(plans, rows[:, :1], strict=True)]])
+
+    return act
 
 
 def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
@@ -201,26 +251,11 @@ def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
     return float(total.mean())
 
 
-def receding(hours: int, config: CocultureConfig, start: Array) -> float:
-    """The same of the optimal plan that ends after so many hours, made anew before each decision."""
-    model, state, ahead = transitions(config, Grid()), start[:, :3], round(60.0 * hours / config.control_min)
-    program, goal = np.empty((config.episode_steps + ahead, len(start))), start[:, 3:]
-    for k in range(len(program)):
-        program[k], goal = share(goal[:, 0]), passed(config, goal)
-    total = np.zeros(len(start))
-    for k in range(config.episode_steps):
-        value = cost_to_go(model, program[k : k + ahead])[1]
-        action = best_action(config, model, value, state, program[k])
-        state = advance(config, state, config.targets()[action], config.control_min)
-        total += np.square(share(state[:, 0]) - program[k])
-    return float(total.mean())
-
-
 def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[str]]:
     """Rows of what is finished with all its seeds: of each task by regret, the lowest first."""
     rows: list[tuple[int, float, list[str]]] = []
     for kind in dict.fromkeys((job.task, job.learner, job.steps) for job in jobs(c)):
-        each = [found[job] for job in (Job(*kind, seed) for seed in range(c.seeds)) if job in found]
+        each = [found[job] for job in (Job(*kind, seed) for seed in seeds(c)) if job in found]
         if len(each) < c.seeds:
             continue
         task, learner, _ = kind
@@ -244,7 +279,7 @@ def by_task(rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
     tasks = list(dict.fromkeys(row[0] for row in rows))
     found: dict[tuple[str, str], dict[str, str]] = {}
     for task, name, steps, regret, worst, *_ in rows:
-        own = name.startswith(OURS) and steps == f"{train.config([f'env={names[task]}']).agent.total_steps}"
+        own = name.startswith(OURS) and steps == f"{own_steps(names[task])}"
         for label in dict.fromkeys(["its own"] * own + [steps] * (not own or name == OURS)):
             found.setdefault((name, label), {})[task] = regret if worst == "–" else f"{regret} ({worst})"
     last = {key: float(cells[tasks[-1]].split()[0]) if tasks[-1] in cells else math.inf for key, cells in found.items()}

@@ -1,7 +1,7 @@
-"""What the supervisor of the policy that ships finds, and what it costs: `python -m tests.studies.supervision`.
+"""Benefit and cost of the shipped policy's supervisor: `python -m tests.studies.supervision`.
 
-False alarms of a sound filter; how far a culture rests from its setpoint under a filter that was blinded on purpose,
-with the supervisor, without it, and under the one-line law on that filter; and ITAE with surprises watched and not.
+False alarms of a sound filter; distance of a culture from its setpoint with a deliberately faulty filter,
+with the supervisor, without it, and with the one-line controller on it; ITAE with and without monitored innovations.
 """
 
 import logging
@@ -78,7 +78,7 @@ def shipped(estimator: EstimatorConfig | None = None) -> RelativeController:
 
 @contextmanager
 def deaf() -> Iterator[None]:
-    """Inside, no surprise alarms anybody."""
+    """Switch off innovation alarms in this context."""
     with patch.object(filters, "FIXED", replace(filters.FIXED, loud=np.inf, quiet=-1.0)):
         yield
 
@@ -96,12 +96,15 @@ def at_rest(found: DensityTrial) -> float:
 
 
 def blinded(config: SupervisionConfig) -> Table:
-    """A sound filter and a blinded one on nominal_noise."""
+    """Run a sound filter and a faulty one on nominal_noise."""
     runs: dict[str, tuple[Make, bool]] = {
         "sound filter, supervised": (shipped, False),
-        "blinded filter, supervised": (lambda: shipped(BLIND), False),
-        "blinded filter, surprises not watched": (lambda: shipped(BLIND), True),
-        "one-line law on the blinded filter": (lambda: Inverse(InverseConfig(estimator=BLIND), EnvConfig()), False),
+        "faulty filter, supervised": (lambda: shipped(BLIND), False),
+        "faulty filter, innovations not monitored": (lambda: shipped(BLIND), True),
+        "one-line controller on the faulty filter": (
+            lambda: Inverse(InverseConfig(estimator=BLIND), EnvConfig()),
+            False,
+        ),
     }
     body = []
     for name, (make, unheard) in runs.items():
@@ -111,7 +114,7 @@ def blinded(config: SupervisionConfig) -> Table:
         body.append((name, number(at_rest(found)), "–" if acted is None else number(100.0 * float(acted.mean()))))
         log.info("%s: rests %s OD off", name, body[-1][1])
     return Table(
-        "blinded", "Rest beside the setpoint, OD, and decisions by the supervisor, %", ("", "OD", "%"), tuple(body)
+        "blinded", "Distance from the setpoint, OD, and decisions by the supervisor, %", ("", "OD", "%"), tuple(body)
     )
 
 
@@ -138,7 +141,7 @@ def false_alarms(config: SupervisionConfig) -> dict[str, float]:
 
 
 def costs(config: SupervisionConfig) -> Table:
-    """ITAE of the measured OD with surprises watched, in % of that without, paired."""
+    """Compare the ITAE of the measured OD with and without monitored innovations, in %, paired."""
     body = []
     for plant in config.plants:
         for name, schedule in (("steps", STEPS), ("switch", SWITCH)):
@@ -154,7 +157,7 @@ def costs(config: SupervisionConfig) -> Table:
             )
             log.info("%s, %s: ITAE %s %%", plant, name, body[-1][1])
     columns = ("", "ITAE, % [95 %]", "decisions by the supervisor, %")
-    return Table("costs", "ITAE with surprises watched against without", columns, tuple(body))
+    return Table("costs", "ITAE with monitored innovations against without", columns, tuple(body))
 
 
 def supervision(config: SupervisionConfig, folder: Path) -> None:

@@ -1,3 +1,3 @@
-"""Laws of the density: readings in, pump rates out, batch first, free of torch and files; and their estimator.
+"""Density controllers: from readings to pump rates, batch first, free of torch and files; and their estimator.
 
-Entered through `experiments.laws.registry`, by whatever closes a loop."""
+Closed loops import it through `experiments.laws.registry`."""

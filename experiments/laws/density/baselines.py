@@ -10,12 +10,12 @@ from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
 __all__ = ["GainScheduled", "GainScheduledConfig", "Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
 
-LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this one: it has a logarithm
+LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this value, which has a logarithm
 
 
 @dataclass(frozen=True)
 class ThresholdConfig(ControllerConfig):
-    """A rate above the setpoint, none below."""
+    """Full rate above the setpoint, none below."""
 
     kind: str = setting("threshold", "controller")
     rate: float = setting(MAX_PUMP_RATE, "rate while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
@@ -23,7 +23,7 @@ class ThresholdConfig(ControllerConfig):
 
 
 class Threshold:
-    """u = rate from x > setpoint until x <= setpoint - hysteresis, else 0: the turbidostat of the textbooks."""
+    """u = rate from x > setpoint until x <= setpoint - hysteresis, else 0: the classic turbidostat."""
 
     remembers = ("on",)
 
@@ -64,15 +64,15 @@ class GainScheduledConfig(ControllerConfig):
 
 
 class GainScheduled:
-    """Proportional control with feed-forward, both looked up by the temperature of the vial: gain scheduling.
+    """Proportional control with feed-forward, both from a table by vial temperature: gain scheduling.
 
       u = clip(tau (mu(T) + K(T) ln(x/r) / h), 0, u_max)
 
     mu(T) (1/min) and K(T) (dimensionless) come from the table, linear between its entries and constant beyond them; h
     is the control period (min), u is in mL/s, shape (N,). If mu(T) is true, ln(x/r) shrinks by 1 - K a period. In ln x
-    the plant is an integrator at each temperature, so the default K is the same for all of them. T is the last known
-    temperature; before one is known, the last of the table. Source: gain scheduling as in Rugh and Shamma 2000,
-    Automatica 36:1401; the paper's introduction names such controllers.
+    the plant is an integrator at each temperature, so the default K is the same for all. T is the last known
+    temperature, initially the last of the table. Source: gain scheduling as in Rugh and Shamma 2000, Automatica
+    36:1401; the paper's introduction names such controllers.
 
     Args: config: the table; model: tau, control period and largest pump rate.
     """
@@ -103,7 +103,7 @@ class GainScheduled:
 
 @dataclass(frozen=True)
 class HoldConfig(ControllerConfig):
-    """A constant rate. mu tau of the model holds any OD if the model is true."""
+    """A constant rate. With a correct model mu tau keeps any OD constant."""
 
     kind: str = setting("hold", "controller")
     rate: float | None = setting(
@@ -112,7 +112,7 @@ class HoldConfig(ControllerConfig):
 
 
 class Hold:
-    """u = constant, whatever is measured: a chemostat. `model` is the calibrated growth model."""
+    """u = constant: a chemostat. `model` is the calibrated growth model."""
 
     def __init__(self, config: HoldConfig, model: EnvConfig) -> None:
         self.rate = model.mu * model.tau if config.rate is None else config.rate

@@ -1,4 +1,4 @@
-"""What a run knows of one vial: a Kalman filter for OD, growth rate, pump gain and what temperature does to growth."""
+"""Kalman filter for OD, growth rate, pump gain and the effect of temperature on growth, of N vials."""
 
 from copy import copy
 from dataclasses import asdict, dataclass
@@ -13,25 +13,25 @@ from experiments.laws.base import Array, Mask, usable
 
 __all__ = ["Estimator", "EstimatorConfig", "fixed"]
 
-USUAL = 0.75  # the mean square of a surprise on a sound reactor
-SHARE_SD = 0.02  # what the growth share that holds at rest changes by beside the filter's error of it
+USUAL = 0.75  # mean square of an innovation on a sound reactor
+SHARE_SD = 0.02  # change of the growth share at rest besides the filter's error of it
 LOG_OD, MU, GAIN, WARMTH = range(4)
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """What no setting of the filter changes, and decides as well; a certificate names it beside the settings."""
+    """Constants of the filter; a certificate has them beside the settings."""
 
-    lowest_od: float = 0.005  # below it the logarithm of a reading says nothing
-    gain_range: tuple[float, float] = (0.2, 3.0)  # of the relative pump gain; a head outside is broken, not slow
+    lowest_od: float = 0.005  # below it the logarithm of a reading is meaningless
+    gain_range: tuple[float, float] = (0.2, 3.0)  # of the relative pump gain; a head outside is broken
     noise_range: tuple[float, float] = (0.1, 25.0)  # of the learned variance over the assumed one
-    trend_weight: float = 0.4  # of the newest surprise in their running mean
-    calm: float = 1.5  # a mean within so many of its sd is no sign of a change
-    farthest: float = 3.0  # a surprise beyond so many of its sd tells no more
-    last: int = 10  # newest readings whose surprises are watched for too large ones ...
+    trend_weight: float = 0.4  # weight of the newest innovation in the running mean
+    calm: float = 1.5  # a mean within this many sd is no sign of a change
+    farthest: float = 3.0  # limit of an innovation in sd
+    last: int = 10  # newest readings monitored for too large innovations ...
     long: int = 40  # ... and for too small ones
-    loud: float = 21.0  # sum of the last squares above which the filter is wrong: less than once a day if it is right
-    quiet: float = 6.0 / 40.0  # mean of the long ones below which it takes itself for less sure than it is
+    loud: float = 21.0  # sum of the last squares above which the filter is wrong: less than one false alarm a day
+    quiet: float = 6.0 / 40.0  # mean of the long window below which its sd is too large
 
 
 FIXED = Fixed()
@@ -40,9 +40,9 @@ TREND_SD = (FIXED.trend_weight / (2.0 - FIXED.trend_weight)) ** 0.5  # of that m
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """What the filter believes about sensor and plant before it has seen them, and which of its parts are on.
+    """Prior of sensor and plant, and active parts of the filter.
 
-    Measured noise of a reading is 0.0033 OD at the floor; 0.005 is what the device's makers put into their own filter.
+    Measured noise of a reading is 0.0033 OD at the floor; 0.005 is the value of the device makers' own filter.
     mu of one medium spans 0.018 to 0.032 1/min in the literature. Heads of a pump differ up to 50 %; the measured
     spread of a dose is 0.05 to 0.30. Growth falls by up to 40 % from 37 to 30 degC.
     """
@@ -93,7 +93,7 @@ class EstimatorConfig:
 
 
 def fixed() -> dict[str, Any]:
-    """Return what decides beside the settings, by name."""
+    """Return the constants that affect decisions, by name."""
     return asdict(FIXED)
 
 
@@ -105,11 +105,11 @@ class Estimator:
       ln x <- ln x + dt (mu + w (T - T0)) - g V/(60 tau),   mu and g random walks,   y = ln(reading) = ln x + noise
 
     which is linear for a known dose and temperature: a time-varying Kalman filter (Kalman 1960), exact without
-    linearising. Beyond it: the level of the noise is learned from the surprises; a reading further off than
-    `gate_sigma` is left out unless the next one agrees with it, and then only OD is set anew; the first dose after a
-    pause is expected smaller; mu and g may walk faster while surprises agree in sign.
+    linearising. Further parts: the noise level is learned from the innovations. A reading beyond `gate_sigma` is
+    ignored unless following readings agree, and then only OD is reset. The first dose after a pause is expected to be
+    smaller. mu and g may change faster while innovations agree in sign.
 
-    Args: config: beliefs and parts; model: mu, tau, control period and largest pump rate, the first guess.
+    Args: config: prior and parts; model: mu, tau, control period and largest pump rate, the initial estimate.
     """
 
     remembers = (
@@ -128,30 +128,30 @@ class Estimator:
         self.cov = np.tile(np.diag([0.0, c.mu_sd**2, c.gain_sd**2, (c.warmth_sd * mu) ** 2]), (n, 1, 1))
         self._minute, self._thermometer, self._warm, self._first_warm = (np.full(n, np.nan) for _ in range(4))
         self._given_ml, self._idle_min = np.zeros(n), np.zeros(n)
-        self._heard = False  # somebody tells what was dosed
+        self._heard = False  # volumes delivered are reported
         self._noise, self._learned = np.ones(n), np.zeros(n)
         self._far, self._far_surprise = np.zeros(n, dtype=np.int64), np.zeros(n)
-        self._trend = np.zeros(n)  # running mean of the surprises in units of their sd
+        self._trend = np.zeros(n)  # running mean of the innovations in units of their sd
         self._squares = np.full((n, FIXED.long), np.nan)  # squares of the newest of them
 
     def dosed(self, volume_ml: Array) -> None:
-        """Fresh medium that went in since this was last called, mL, (N,)."""
+        """Take the volume delivered since the last call, mL, (N,)."""
         if self.config.told:
             self._given_ml, self._heard = volume_ml + (self._given_ml if self._heard else 0.0), True
 
     def decided(self, rate: Array) -> None:
-        """Pump rates decided, mL/s, (N,); they count as given as long as nobody tells what was."""
+        """Take the decided pump rates, mL/s, (N,); they count as delivered until volumes are reported."""
         if not self._heard:
             self._given_ml = 60.0 * self.model.control_min * rate
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Temperatures now, and, with `recovery`, the readings of `rows`; arguments as `see`."""
+        """Take the temperatures and, with `recovery`, the readings of `rows`; arguments as `see`."""
         self._thermometer = np.where(np.isfinite(temperature), temperature, self._thermometer)
         if self.config.recovery:
             self.see(od, minute, rows)
 
     def see(self, od: Array, minute: Array, rows: Mask) -> None:
-        """Take the readings of `rows` that were not taken yet, each shape (N,); nan is no reading."""
+        """Take the new readings of `rows`, each shape (N,); nan is no reading."""
         idx = np.flatnonzero(usable(od, rows) & ~(minute <= self._minute))
         if not idx.size:
             return
@@ -185,7 +185,7 @@ class Estimator:
         return np.reshape(found, (-1, 2))
 
     def _warmer(self, idx: NDArray[np.intp]) -> Array:
-        """Mean temperature since the reading before, over the first one, degC; 0 where none was ever measured."""
+        """Return the mean temperature since the previous reading, relative to the first, degC; 0 if unknown."""
         now = self._thermometer[idx]
         before = np.where(np.isfinite(self._warm[idx]), self._warm[idx], now)
         self._first_warm[idx] = np.where(np.isfinite(self._first_warm[idx]), self._first_warm[idx], now)
@@ -193,9 +193,9 @@ class Estimator:
         return np.asarray(np.nan_to_num(0.5 * (now + before) - self._first_warm[idx]))
 
     def _predict(self, idx: NDArray[np.intp], dt: Array, warmer: Array) -> None:
-        """Advance the rows `idx` by dt minutes, what was dosed, and the warmth."""
+        """Advance the rows `idx` by dt minutes, the dose, and the temperature difference."""
         c, n = self.config, idx.size
-        dose = self._given_ml[idx] / (60.0 * self.model.tau)  # ln of the dilution by a sound pump
+        dose = self._given_ml[idx] / (60.0 * self.model.tau)  # ln of the dilution by a normal pump
         first = (self._idle_min[idx] >= c.pause_min) & (dose > 0.0)
         self._idle_min[idx] = np.where(dose > 0.0, 0.0, self._idle_min[idx] + dt)
         arrives = np.where(first, c.first_dose, 1.0)
@@ -210,7 +210,7 @@ class Estimator:
         self.cov[idx] = np.einsum("nij,njk,nlk->nil", step, self.cov[idx], step) + noise
 
     def _update(self, idx: NDArray[np.intp], y: Array, assumed: Array, began: Mask) -> None:
-        """Take y = ln OD with the assumed variances into the rows `idx`."""
+        """Update the rows `idx` with y = ln OD and its assumed variances."""
         c, mean, cov = self.config, self.mean[idx], self.cov[idx]
         surprise = y - mean[:, LOG_OD]
         variance = assumed * self._noise[idx]
@@ -219,7 +219,7 @@ class Estimator:
         agrees = np.abs(surprise - self._far_surprise[idx]) < c.gate_sigma * np.sqrt(2.0 * variance)
         self._far[idx] = np.where(far, np.where(agrees, self._far[idx], 0) + 1, 0)
         self._far_surprise[idx] = surprise
-        # A first reading, or a jump that stays, sets the OD anew and teaches nothing about the rest.
+        # A first reading, or a persistent jump, resets only the OD.
         jump = np.abs(np.expm1(surprise)) * np.exp(mean[:, LOG_OD])
         asked = np.clip(np.ceil(jump / c.gate_od), 2, c.gate_max) if c.gate_od else c.gate_max
         anew = ~began | (self._far[idx] >= asked)
@@ -250,17 +250,17 @@ class Estimator:
 
     @property
     def gain(self) -> Array:
-        """Relative pump gain within what a pump can be, (N,)."""
+        """Relative pump gain within its possible range, (N,)."""
         return np.asarray(np.clip(self.mean[:, GAIN], *FIXED.gain_range))
 
     @property
     def full_pump(self) -> Array:
-        """B = g u_max h / tau: what one period of full pump takes off ln x, (N,)."""
+        """B = g u_max h / tau: decrease of ln x in one period at full pump rate, (N,)."""
         m = self.model
         return np.asarray(self.gain * m.max_pump_rate * m.control_min / m.tau)
 
     def relative(self, setpoint: Array) -> tuple[Array, Array]:
-        """Error e = ln(x/r)/B and growth share s = mu h / B now (`envs/relative.py`), each (N,)."""
+        """Return the current error e = ln(x/r)/B and growth share s = mu h / B (`envs/relative.py`), each (N,)."""
         warmer = np.nan_to_num(self._warm - self._first_warm)
         mu = self.mean[:, MU] + self.mean[:, WARMTH] * warmer
         error = self.mean[:, LOG_OD] - np.log(np.maximum(setpoint, FIXED.lowest_od))
@@ -268,25 +268,25 @@ class Estimator:
 
     @property
     def loudness(self) -> Array:
-        """Sum of squares of the last ten surprises in units of their sd, each at most 9; about 8 where all is well."""
+        """Sum of squares of the last ten innovations in units of their sd, each at most 9; normally about 8."""
         return np.asarray(np.nansum(self._squares[:, -FIXED.last :], axis=1))
 
     @property
     def loud(self) -> NDArray[np.bool_]:
-        """Whether that is more than can be, (N,)."""
+        """Whether that is impossible for a right filter, (N,)."""
         return np.asarray(self.loudness > FIXED.loud)
 
     @property
     def quiet(self) -> NDArray[np.bool_]:
-        """Whether they have long been far smaller, (N,)."""
+        """Whether innovations have been far smaller for a long time, (N,)."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self._squares.mean(axis=1) < FIXED.quiet)
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
         """Return the filter's standard deviations of the error e and of the growth share s of `relative`, each (N,).
 
-        To first order, with what ln x, mu and g have in common: at rest mu = g u / tau is known better than either.
-        B is taken as known for e, as the proof has it, which takes an error of the gain by itself.
+        To first order, with the covariances of ln x, mu and g: at rest mu = g u / tau is known better than either. For
+        e, B counts as known, as in the proof, which treats an error of the gain separately.
         """
         warmer = np.nan_to_num(self._warm - self._first_warm)
         share, period = self.relative(setpoint)[1], self.model.control_min / self.full_pump
@@ -297,7 +297,7 @@ class Estimator:
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
         """Return the standard deviations for the user: with B's uncertainty in e, scaled by recent innovations.
 
-        That of s is of the share that holds the culture at rest, which changes beside the filter's error of it.
+        The sd of s refers to the growth share at rest, which has a further change.
         """
         _, share = self.doubt(setpoint)
         slope = np.zeros((len(share), 4))

@@ -1,4 +1,4 @@
-"""What laws, supervisor and certificate ask of an estimator of the density, and where one is added."""
+"""Interface of density estimators for controllers, supervisor and certificate, and their registry."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ __all__ = ["DensityEstimator", "WithEstimator", "add", "build", "config_at", "se
 class DensityEstimator(Remembers, Protocol):
     """Estimates of error e = ln(x/r)/B and growth share s = mu h/B of N vials (`envs/relative.py`), structurally.
 
-    A law calls for each sample `watch`, `see`, `relative` and the rest, then `decided`; `dosed` comes in between.
+    For each sample a controller calls `watch`, `see`, `relative` and the rest, then `decided`; `dosed` comes in
+    between.
     """
 
     def reset(self, n: int) -> None:
         """Forget everything; N rows."""
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Take a sample of reactors that need not be controlled yet, as `Watches.watch`."""
+        """Take a sample, also before control begins, as `Watches.watch`."""
 
     def see(self, od: Array, minute: Array, rows: Mask) -> None:
-        """Take the sample on which a law decides; `rows` may be used."""
+        """Take the sample of a decision; `rows` are usable."""
 
     def decided(self, rate: Array) -> None:
-        """Take what was decided, mL/s, (N,), for where nobody tells what was given."""
+        """Take the decided rates, mL/s, (N,), for the case that volumes delivered are not reported."""
 
     def dosed(self, volume_ml: Array) -> None:
-        """Take fresh medium that went in since this was last called, mL, (N,)."""
+        """Take the volume delivered since the last call, mL, (N,)."""
 
     def relative(self, setpoint: Array) -> tuple[Array, Array]:
         """Return e and s now, each (N,)."""
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the sd of both that the supervisor holds against the bounds of a certificate, each (N,)."""
+        """Return the sd of both for the comparison with a certificate's bounds, each (N,)."""
 
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
         """Return the sd of both for the user, each (N,)."""
 
     @property
     def full_pump(self) -> Array:
-        """B, what one period of full pump takes off ln x, (N,)."""
+        """B, decrease of ln x in one period at full pump rate, (N,)."""
 
     @property
     def loudness(self) -> Array:
@@ -55,18 +56,18 @@ class DensityEstimator(Remembers, Protocol):
 
     @property
     def loud(self) -> Mask:
-        """Whether readings are far further off than it believes possible, (N,)."""
+        """Whether innovations are impossibly large, (N,)."""
 
     @property
     def quiet(self) -> Mask:
-        """Whether they have long been far closer, so that it takes itself for less sure than it is, (N,)."""
+        """Whether they have been far too small for a long time, (N,)."""
 
     def explain(self) -> dict[str, Array]:
-        """Return what is behind the estimates, by name, (N,) each."""
+        """Return the values behind the estimates, by name, (N,) each."""
 
 
 class EstimatorKind(NamedTuple):
-    """What makes an estimator of config and model, and what decides in it beside its config, by name."""
+    """Function that makes an estimator from config and model, and its constants by name."""
 
     config: type[Any]
     make: Callable[[Any, EnvConfig], DensityEstimator]
@@ -82,13 +83,13 @@ def add(
     make: Callable[[Any, EnvConfig], DensityEstimator],
     fixed: Callable[[], Mapping[str, Any]] = dict,
 ) -> None:
-    """Make an estimator known as `controller.estimator.kind=KIND`.
+    """Register an estimator as `controller.estimator.kind=KIND`.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`.
       make: called with config and growth model.
-      fixed: what decides beside the config and no config changes; a certificate names it, too.
+      fixed: constants that affect decisions; a certificate also has them.
     Raises: ValueError for a kind that exists.
     """
     if kind in KINDS:
@@ -97,28 +98,28 @@ def add(
 
 
 def config_at(kind: str, key: str = "controller.estimator") -> Any:
-    """Return the default config of an estimator, "": kalman. Raises: ValueError naming those there are."""
+    """Return the default config of an estimator, "": kalman. Raises: ValueError with the known kinds."""
     if (kind or "kalman") not in KINDS:
         raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(KINDS))
     return KINDS[kind or "kalman"].config()
 
 
 def build(config: Any, model: EnvConfig) -> DensityEstimator:
-    """Make the estimator of a config; mu and tau of the model are where it begins."""
+    """Make the estimator of a config; it starts at mu and tau of the model."""
     return KINDS[config.kind].make(config, model)
 
 
 def settings(config: Any) -> dict[str, Any]:
-    """Return everything that decides in the estimator of a config, by name: `estimator.KEY`, `filter.KEY`."""
+    """Return all settings and constants of the estimator of a config, by name: `estimator.KEY`, `filter.KEY`."""
     own = {f"estimator.{key}": value for key, value in asdict(config).items()}
     fixed = {f"filter.{key}": value for key, value in KINDS[config.kind].fixed().items()}
     return {key: list(value) if isinstance(value, tuple) else value for key, value in (own | fixed).items()}
 
 
 class WithEstimator:
-    """A controller that estimates nothing, and the default estimator beside it, which decides nothing.
+    """A controller without an estimator, with the default estimator for information only.
 
-    Args: law: the controller. model: mu, tau and control period with which the estimator begins.
+    Args: law: the controller. model: initial mu and tau of the estimator, and control period.
     """
 
     def __init__(self, law: Controller, model: EnvConfig) -> None:
@@ -137,7 +138,7 @@ class WithEstimator:
             self.law.watch(od, temperature, minute, rows)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`: the law's."""
+        """See `Controller.act` of the controller."""
         self.estimator.see(od, minute, rows)
         rate = self.law.act(od, setpoint, minute, rows)
         self.estimator.decided(rate)
@@ -150,6 +151,6 @@ class WithEstimator:
             self.law.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """Explain the law's decision, and the estimates by which changes are aimed ahead."""
+        """Explain the controller's decision, and the estimates for announced changes."""
         own = self.law.explain() if isinstance(self.law, Explains) else {}
         return self.estimator.explain() | own

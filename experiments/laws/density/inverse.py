@@ -1,4 +1,4 @@
-"""Inverse control on the estimator: the pump rate that puts the next reading on the setpoint."""
+"""Inverse control with the estimator: the pump rate that brings the next reading to the setpoint."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ __all__ = ["Inverse", "InverseConfig"]
 
 @dataclass(frozen=True)
 class InverseConfig(ControllerConfig):
-    """The one-line law and what it believes."""
+    """Settings of the one-line controller and its estimator."""
 
     kind: str = setting("inverse", "controller")
     levels: int = setting(
@@ -33,9 +33,10 @@ class InverseConfig(ControllerConfig):
 class Inverse:
     """Certainty-equivalent inverse control: u = u_max clip(e + s, 0, 1) with the estimates of error and growth share.
 
-    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range, and to the nearest of its levels where it has some.
+    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range, and rounded to the nearest level if `levels` is
+    set.
 
-    Args: config: the filter's beliefs; model: mu, tau, control period and largest pump rate, the first guess.
+    Args: config: settings of the estimator; model: mu, tau, control period and largest pump rate, the initial estimate.
     """
 
     remembers = ("estimator", "rate")

@@ -1,4 +1,4 @@
-"""The exported DQN policy as a controller: of (OD, setpoint), without memory, or of (error, growth share) estimated."""
+"""The exported DQN policy as a controller of (OD, setpoint), without memory, or of estimated (error, growth share)."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,14 +17,14 @@ from experiments.laws.density.estimator import EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
-WATCHED = 2.0  # sd of an estimate that count as its error
+WATCHED = 2.0  # number of sd that count as the error of an estimate
 LOUDER = 1.5  # loudness of the policy's filter over that of the second one, above which the second one knows better
 NOTED = 36.0  # loudness that is worth a note, whoever knows better
 
 
 @dataclass(frozen=True)
 class LearnedConfig(ControllerConfig):
-    """Everything about a policy is in its file, the estimator's settings too."""
+    """Settings of a learned controller; the policy's file has all others, including the estimator's."""
 
     kind: str = setting("dqn", "controller")
     estimator: dict[str, Any] = setting(
@@ -35,8 +35,7 @@ class LearnedConfig(ControllerConfig):
 def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: EstimateBounds | None) -> Controller:
     """Build the controller that fits a policy's observation.
 
-    Args: bounds: of the policy's certificate, within which it may act; None where it has none.
-    Raises: ValueError for settings that do not exist or fit.
+    Args: bounds: of the policy's certificate; None without one. Raises: ValueError for unknown or unsuitable settings.
     """
     if policy.observation != RELATIVE:
         return LearnedController(policy)
@@ -44,7 +43,7 @@ def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: Est
 
 
 def _estimator(policy: Policy, changes: Mapping[str, Any]) -> Any:
-    """Put changes into the settings of a policy's file; another kind begins at its own. Raises: ValueError."""
+    """Apply changes to the settings of a policy's file; another kind starts from its defaults. Raises: ValueError."""
     filed = policy.metadata.get("estimator", {})
     kind = str(filed.get("kind", ""))
     if (asked := str(changes.get("kind", kind))) != kind:
@@ -54,9 +53,9 @@ def _estimator(policy: Policy, changes: Mapping[str, Any]) -> Any:
 
 
 def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Collect the settings that decide beside a policy's network; a certificate names them, too.
+    """Collect the settings that affect decisions besides a policy's network; a certificate also has them.
 
-    Args: changes: of its estimator. Raises: ValueError for settings that do not exist or fit.
+    Args: changes: of its estimator. Raises: ValueError for unknown or unsuitable settings.
     """
     if policy.observation != RELATIVE:
         return {}
@@ -76,11 +75,11 @@ class LearnedController:
         self._q = np.zeros((0, policy.actions.size), dtype=np.float32)
 
     def reset(self, n: int) -> None:
-        """There is nothing to forget but the last explanation."""
+        """Forget the last explanation; there is no other memory."""
         self._q = np.full((n, self.policy.actions.size), np.nan, dtype=np.float32)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """Greedy pump rate, mL/s, shape (N,); 0 where the reading is no number."""
+        """Return the greedy pump rate, mL/s, shape (N,); 0 without a reading."""
         seen = rows & np.isfinite(od)
         observation = np.stack([np.where(seen, od, 0.0), setpoint], axis=1)
         q = self.policy.q_values(observation)
@@ -88,18 +87,18 @@ class LearnedController:
         return np.where(seen, self.policy.actions[q.argmax(axis=1)], 0.0)
 
     def explain(self) -> dict[str, Array]:
-        """Q value of the chosen pump rate and its lead over the second best, each (N,)."""
+        """Return the Q value of the chosen pump rate and its lead over the second best, each (N,)."""
         return lead(self._q)
 
 
 def lead(q: np.ndarray) -> dict[str, Array]:
-    """Best Q value and its lead over the second best, each (N,); q: (N, A)."""
+    """Return the best Q value and its lead over the second best, each (N,); q: (N, A)."""
     ranked = np.sort(q.astype(np.float64), axis=1)
     return {"q_best": ranked[:, -1], "q_lead": ranked[:, -1] - ranked[:, -2]}
 
 
 class RelativeController:
-    """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s as `Estimator` knows them.
+    """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s of the `Estimator`.
 
     A supervisor stands over it. Where the estimator's surprises do not fit what it believes, or twice its sd of e or s
     leaves the bounds of the certificate, the one-line law u = u_max clip(e + s, 0, 1) decides, on a second filter whose
@@ -109,7 +108,8 @@ class RelativeController:
     proven: above it no pump rate holds the culture.
 
     Args: policy: with observation (error, growth_share). estimator: its settings. model: mu, tau, control period and
-      largest pump rate; mu and tau are where the filters begin. bounds: of the certificate; None: surprises alone.
+      largest pump rate; the filters start at mu and tau. bounds: of the certificate; None: only innovations are
+      monitored.
     """
 
     remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm", "noted")
@@ -153,7 +153,7 @@ class RelativeController:
         return self._rate.copy()
 
     def _outside(self, setpoint: Array, observation: Array) -> Mask:
-        """Where the estimate may be off by more than was proven, (N,)."""
+        """Return whether the estimate may exceed the proven errors, (N,)."""
         if self.bounds is None:
             return np.zeros(setpoint.size, dtype=np.bool_)
         error, doubt = (WATCHED * sd for sd in self.estimator.doubt(setpoint))
@@ -169,7 +169,7 @@ class RelativeController:
             each.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """Whether the supervisor decided, what the policy saw with its sd, and the estimates behind it, each (N,)."""
+        """Return whether the supervisor decided, the policy's inputs with their sd, and the estimates, each (N,)."""
         flags = {"supervised": self._supervised, "alarm": self._alarm, "noted": self._noted}
         said = {name: flag.astype(np.float64) for name, flag in flags.items()}
         (error, share), (error_sd, share_sd) = self._seen.T.copy(), self._sure.T.copy()

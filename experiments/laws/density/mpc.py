@@ -11,7 +11,7 @@ from experiments.laws.density.pso import SwarmConfig, minimise
 
 __all__ = ["Mpc", "MpcConfig", "Problem"]
 
-LOWEST_OD = 1e-3  # a reading below is taken for this: the model cannot grow from nothing
+LOWEST_OD = 1e-3  # a lower reading counts as this: the model cannot grow from zero
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Problem:
     penalty: float
 
     def factors(self, v: Array) -> tuple[Array, Array]:
-        """f(u_max v) and df/dv, shape of v; in closed form, because a swarm asks ten thousand times per decision."""
+        """Return f(u_max v) and df/dv, shape of v; in closed form, for ten thousand calls per decision."""
         m = self.model
         h = m.control_min / m.substeps
         slope = -h * m.max_pump_rate / m.tau
@@ -63,13 +63,13 @@ class Problem:
         return one * power, m.substeps * slope * power * d_one
 
     def cost(self, v: Array) -> Array:
-        """Cost of moves v, shape (R, P, H) -> (R, P)."""
+        """Return the cost of moves v, shape (R, P, H) -> (R, P)."""
         miss = self._reached(self.factors(v)[0]) - self.setpoint[:, None, None]
         outside = (v < 0.0) | (v > 1.0)
         return np.asarray(np.einsum("rph,rph->rp", miss, miss) + self.penalty * outside.sum(axis=-1))
 
     def _reached(self, factors: Array) -> Array:
-        """x_1 .. x_H, shape (R, P, H)."""
+        """Return x_1 .. x_H, shape (R, P, H)."""
         reached = np.empty_like(factors)
         x = self.start[:, None]
         for k in range(factors.shape[-1]):
@@ -78,11 +78,11 @@ class Problem:
         return reached
 
     def predict(self, v: Array) -> Array:
-        """x_1 .. x_H for moves v, shape (R, H) -> (R, H)."""
+        """Return x_1 .. x_H for moves v, shape (R, H) -> (R, H)."""
         return self._reached(self.factors(v[:, None])[0])[:, 0]
 
     def by_swarm(self, start: Array, rngs: list[np.random.Generator], config: SwarmConfig) -> Array:
-        """Best moves found by one particle swarm per row, shape (R, H)."""
+        """Optimise moves by one particle swarm per row, shape (R, H)."""
         moves, _ = minimise(self.cost, 0.0, 1.0, start, rngs, config)
         return moves
 
@@ -103,7 +103,7 @@ class Problem:
         return moves
 
     def value_and_gradient(self, v: Array, scale: float = 1.0) -> tuple[float, Array]:
-        """Cost inside the box and its exact gradient for the single row of a problem, both times `scale`.
+        """Return the cost inside the box and its exact gradient for the single row of a problem, both times `scale`.
 
         dx_j/dv_k = x_j f'(v_k)/f(v_k) for j >= k, so the gradient is a reversed cumulative sum.
         """
@@ -115,7 +115,7 @@ class Problem:
 
 
 def _power(base: Array, exponent: int) -> Array:
-    """base**exponent by repeated squaring: several times faster than a general power."""
+    """Return base**exponent by repeated squaring: several times faster than a general power."""
     result = np.ones_like(base)
     while exponent:
         if exponent & 1:
@@ -128,7 +128,7 @@ def _power(base: Array, exponent: int) -> Array:
 class Mpc:
     """Every minute: measure, minimise `Problem` over the horizon, apply the first move.
 
-    Each solution, shifted by one period, is where one particle (or the gradient) starts the next time.
+    Each solution, shifted by one period, is the start of one particle (or of the gradient) in the next period.
 
     Args: config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
     """
@@ -140,7 +140,7 @@ class Mpc:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`. The swarms' random streams start anew: one per reactor, the same whatever n is."""
+        """See `Controller.reset`. The swarms' random streams start anew: one per reactor, the same for every n."""
         steady = np.clip(self.model.mu * self.model.tau / self.model.max_pump_rate, 0.0, 1.0)
         self._moves = np.full((n, self.config.horizon), steady)
         self._predicted = np.full((n, self.config.horizon), np.nan)
@@ -157,7 +157,7 @@ class Mpc:
                 moves = problem.by_swarm(start, [self._rngs[i] for i in idx], self.config.swarm)
             else:
                 moves = problem.by_gradient(start)
-            # A penalty of 100 stops binding where the OD error itself costs as much: at the 12 to 14 of a broken read.
+            # A penalty of 100 is too small if the OD error itself costs as much: at the 12 to 14 of a failed read.
             moves = np.clip(moves, 0.0, 1.0)
             self._moves[idx], self._predicted[idx] = moves, problem.predict(moves)
             self._rate[idx] = moves[:, 0] * self.model.max_pump_rate

@@ -1,4 +1,4 @@
-"""The yardstick: dynamic programming on the very plant that is being controlled."""
+"""The reference: dynamic programming on the controlled plant itself."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +21,7 @@ DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
 
 @dataclass(frozen=True)
 class OracleConfig(ControllerConfig):
-    """Action grid and discount. 129 levels hold the learned policy's 17, and finer ones gain nothing measurable."""
+    """Action grid and discount. 129 levels contain the learned policy's 17; finer grids have no measurable effect."""
 
     kind: str = setting("oracle", "controller")
     levels: int = setting(129, "number of pump rates on [0, max_pump_rate]", within=(2, 1001))
@@ -38,17 +38,17 @@ def _value(
 
 
 class Oracle:
-    """u = argmin_u (y(u) - r)^2 + gamma r^2 V(y(u)/r), with y(u) the reading that a noise-free sensor will show next.
+    """u = argmin_u (y(u) - r)^2 + gamma r^2 V(y(u)/r), with y(u) the next reading of a noise-free sensor.
 
-    It knows, of each vial: the growth rate at this moment (drawn mu, substrate, temperature, drift), flow, dead time
-    and shortest pulse of its pump head, the volume, and what the sensor would show without noise, which it uses in
-    place of the reading. V is that of the vial's drawn mu and tau = volume/(60 flow). It does not know what is drawn
-    later: the spread of the coming dose, the next reading's noise, the drift within the coming minute; nor priming and
-    the wall. So it is the bound on `nominal`, and elsewhere what full knowledge of the present is worth.
+    It knows for each vial: the current growth rate (drawn mu, substrate, temperature, drift), flow, dead time and
+    shortest pulse of the pump head, the volume, and the noise-free reading, which it uses instead of the reading. V is
+    that of the vial's drawn mu and tau = volume/(60 flow). It does not know later draws: spread of the next dose, noise
+    of the next reading, drift within the next minute; nor priming and the wall. So it is the bound on `nominal`, and on
+    other plants the value of full knowledge of the present.
 
     Args:
       config: action grid and discount; plant: the vials it controls, in the order of the rows; model: control period
-      and largest pump rate; flow_ml_s: flow that the backend believes in when it turns a rate into an on-time.
+      and largest pump rate; flow_ml_s: flow with which the backend converts a rate to an on-time.
     """
 
     def __init__(self, config: OracleConfig, plant: Plant, model: EnvConfig, flow_ml_s: float = 1.0) -> None:
@@ -68,7 +68,7 @@ class Oracle:
             raise ValueError(f"oracle of a plant with {self.plant.n} vials: allowed {self.plant.n} reactors, not {n}")
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`; the reading itself is not looked at."""
+        """See `Controller.act`; the reading itself is not used."""
         plant = self.plant
         after = plant.expected_od(self.model.control_min, self._on_s + np.zeros(plant.n))
         seen = plant.sensor.apparent(after, plant.culture.wall, plant.minutes)

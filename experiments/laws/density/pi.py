@@ -1,4 +1,4 @@
-"""PI control of OD: the Chi.Bio's on-board law as it is, and one that is tuned."""
+"""PI control of OD: the Chi.Bio's on-board controller, and a tuned one."""
 
 from dataclasses import dataclass
 
@@ -11,20 +11,20 @@ from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 
-ASSUMED_FLOW_ML_S = 4.0  # what the device's law takes a pump to deliver; real ones: about 1 (docs/biology.md, Pumps)
-LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
+ASSUMED_FLOW_ML_S = 4.0  # pump flow assumed by the device's controller; real pumps: about 1 (docs/biology.md, Pumps)
+LOWEST_OD = 1e-6  # the device uses this for a setpoint of 0 or less
 
 
 @dataclass(frozen=True)
 class ChiBioPIConfig(ControllerConfig):
-    """What the device's law is told; its gains are constants of the device's code."""
+    """Settings of the device's controller; its gains are constants of the device's code."""
 
     kind: str = setting("pi", "controller")
     max_pump_rate: float = setting(MAX_PUMP_RATE, "limit, as on the device", "mL/s", above=0.0, at_most=0.05)
 
 
 class ChiBioPI:
-    """The Chi.Bio's `RegulateOD`, number for number (docs/device.md, Regulation).
+    """The Chi.Bio's `RegulateOD`, exactly (docs/device.md, Regulation).
 
     With x the reading, x' the one before, r the setpoint, e = x - r and dt the minutes between the last two recorded
     times (which are those of the two cycles before this one, because a cycle is recorded after its decision):
@@ -35,7 +35,7 @@ class ChiBioPI:
       I2 = 0 if |e| > 0.1 and |x - x'| < 0.05; else I2 + 0.01 e if |x - x'| < 0.1; else I2
       u  = clip(P + I1 + I2, 0, 0.02); 0 if x - x' > 0.04 (noise guard); 0 in the first two cycles
 
-    Args: volume_ml: V, what the device is told of the culture, mL, (N,) or one for all.
+    Args: volume_ml: V, culture volume set on the device, mL, (N,) or one for all.
     """
 
     remembers = ("cycles", "before", "times", "p", "i1", "i2", "rate")
@@ -59,7 +59,7 @@ class ChiBioPI:
         x, r = np.where(now, od, 1.0), np.where(setpoint > 0.0, setpoint, LOWEST_OD)
         error, change = x - r, np.abs(x - self._before)
         interval = self._times[1] - self._times[0]
-        interval = np.where(interval > 0.0, interval, 1.0)  # before two records exist; u is 0 then
+        interval = np.where(interval > 0.0, interval, 1.0)  # before two records exist, u is 0
         gain = self._volume_ml / (60.0 * ASSUMED_FLOW_ML_S) / interval
         p = np.where(x > 0.0, np.log(np.maximum(x, LOWEST_OD) / r) * gain, 0.0)
         i1 = self._i1 + np.where((change < 0.05) & (error > 0.025), 0.1 * error, 0.0)
@@ -84,7 +84,7 @@ class ChiBioPI:
 
 @dataclass(frozen=True)
 class TunedPIConfig(ControllerConfig):
-    """The two times of the tuning rule; mu, tau and the largest pump rate come from the model."""
+    """Settings of the tuning rule; mu, tau and the largest pump rate come from the model."""
 
     kind: str = setting("pi_tuned", "controller")
     delay_min: float = setting(1.0, "delay until a decision is visible: one control period", "min", within=(0.5, 60))
@@ -103,7 +103,7 @@ class TunedPI:
 
     which is the SIMC rule for an integrating process with dead time (Skogestad 2003, J. Process Control 13:291). With
     its tight setting t_c = delay = one control period, the sampled closed loop has the double pole 0.75. Anti-windup:
-    I stands still while u is at a bound and z would push it further.
+    I is constant while u is at a bound and z would push it further.
 
     Args: config: the rule's two times; model: mu, tau, control period and the largest pump rate.
     """

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SwarmConfig:
-    """How the swarms search.
+    """Settings of the particle swarms.
 
     Inertia and attraction are Clerc and Kennedy's constriction coefficients in inertia form. 40 particles and 120
     iterations end within 1 % of the optimum from every one of 400 random cold starts.
@@ -54,14 +54,13 @@ def minimise(
 
       v <- w v + c r1 (own best - x) + c r2 (swarm's best - x),   x <- x + v,   r1, r2 uniform per dimension
 
-    Nothing keeps particles inside [low, high]: that is where they start, at rest, and it is for the cost to say what
-    is allowed.
+    Particles start at rest in [low, high] and may leave it; the cost must penalise that.
 
     Args:
       cost: positions (R, P, H) -> costs (R, P); swarm r's costs may depend on r only.
       low, high: box the particles are scattered over.
       start: one place per swarm where a particle begins, shape (R, H), e.g. the last solution shifted by a step.
-      rngs: one generator per swarm, so that a swarm does the same whichever others run beside it.
+      rngs: one generator per swarm, so that swarms are independent.
     Returns: best positions (R, H) and their costs (R,). Raises: nothing; `SwarmConfig` has checked the search.
     """
     swarms, dimensions = start.shape

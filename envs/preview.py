@@ -1,0 +1,118 @@
+"""The density with the next setpoint known ahead: what takes minutes can begin before it is asked for."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from conf.schema import require, setting
+from envs.gym_adapter import EpisodeEnv
+from envs.task import MAX_OD, EnvConfig
+from envs.vector_env import BioreactorVectorEnv
+
+__all__ = ["PreviewConfig", "PreviewEnv", "PreviewVectorEnv", "half_way", "minutes_ahead", "passed", "program_of"]
+
+Array = NDArray[np.float64]
+FAR = 1e6  # periods: where no change is known
+
+
+@dataclass(frozen=True)
+class PreviewConfig(EnvConfig):
+    """`env=preview`: the task of the paper with one change of the setpoint, which is announced.
+
+    Decisions are 5 min apart, so that a change is six of them ahead when it is announced.
+    """
+
+    kind: str = setting("preview", "which task")
+    control_min: float = setting(5.0, "control period", "min", above=0.0, at_most=60.0)
+    episode_steps: int = setting(12, "control steps per episode, ended by truncation", at_least=1)
+    preview_min: float = setting(30.0, "how long before it the change is announced", "min", above=0.0, at_most=1440.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(len(set(self.setpoints)) > 1, "env.setpoints", self.setpoints, "two or more, to change between")
+        even = self.preview_min % self.control_min == 0.0
+        require(even, "env.preview_min", self.preview_min, f"a multiple of env.control_min = {self.control_min:g}")
+
+
+def passed(control_min: float, goal: Array) -> Array:
+    """Setpoint, next one and minutes to it, (..., 3), one decision later: the change comes nearer, or has come.
+
+    Where nothing is announced, the next setpoint is the present one and the time 0.
+    """
+    now, following, time = (goal[..., k] for k in range(3))
+    left = np.maximum(time - control_min, 0.0)
+    return np.stack([np.where(left > 0.0, now, following), following, left], axis=-1)
+
+
+def program_of(control_min: float, goal: Array, steps: int) -> Array:
+    """Setpoint in force during each of the next decisions, (steps, ...), of what is announced now, (..., 3)."""
+    program = np.empty((steps, *goal.shape[:-1]))
+    for k in range(steps):
+        program[k], goal = goal[..., 0], passed(control_min, goal)
+    return program
+
+
+def minutes_ahead(control_min: float, preview_min: float, uniform: Array) -> Array:
+    """Turn uniform numbers into times to a change: any whole number of decisions up to the preview, min."""
+    return np.asarray(control_min * (1.0 + np.floor(uniform * (preview_min / control_min))))
+
+
+def half_way(now: Array, following: Array, left: Array, full: Array | float, share: Array | float) -> Array:
+    """OD on the best way to the next setpoint, `left` periods before the change (after it: negative).
+
+    Growth or full pump takes the culture there, and it is half-way when the setpoint changes. On an exponential an
+    error weighs by the time spent at it, dx / x, so with the OD m at the change the sum of squared errors before it
+    grows by (m - now)^2 / m and the sum after it falls by (following - m)^2 / m.
+
+    Args: full: what a period of full pump takes off ln OD. share: of it, that growth takes. Broadcastable to (N,).
+    """
+    direction = np.sign(following - now)
+    speed = full * np.where(direction > 0.0, share, 1.0 - np.asarray(share))
+    way = 0.5 * (now + following) * np.exp(np.clip(-direction * speed * np.minimum(left, FAR), -20.0, 20.0))
+    return np.asarray(np.clip(way, np.minimum(now, following), np.maximum(now, following)))
+
+
+class PreviewVectorEnv(BioreactorVectorEnv):
+    """A culture held at a setpoint that changes once; when and to what is announced.
+
+    Dynamics, action and reward: as `BioreactorVectorEnv`; a step is judged by the setpoint in force when it begins.
+
+    | observation | meaning                                             | range              | unit |
+    |-------------|-----------------------------------------------------|--------------------|------|
+    | 0           | optical density x                                   | [0, 1000]          | -    |
+    | 1           | setpoint                                            | (0, 2]             | -    |
+    | 2           | next setpoint; the present one after the change     | (0, 2]             | -    |
+    | 3           | time to the change; 0 after it                      | 0 to `preview_min` | min  |
+
+    Start: x, both setpoints and the time of the change drawn from the copy's own stream.
+    """
+
+    default = PreviewConfig
+    config: PreviewConfig
+    names = ("od", "setpoint", "next_setpoint", "minutes_to_change")
+    numbers = 4
+
+    @staticmethod
+    def observations(config: Any) -> spaces.Box:
+        """As in the table, float32."""
+        high = np.array([MAX_OD, 2.0, 2.0, config.preview_min], dtype=np.float32)
+        return spaces.Box(low=0.0, high=high, dtype=np.float32)
+
+    def _begun(self, numbers: Array) -> Array:
+        following = super()._begun(numbers[:, [0, 2]])[:, 1]
+        time = minutes_ahead(self.config.control_min, self.config.preview_min, numbers[:, 3])
+        return np.column_stack([super()._begun(numbers), following, time])
+
+    def _advance(self, actions: NDArray[np.intp]) -> Array:
+        reward = super()._advance(actions)
+        self.state[:, 1:] = passed(self.config.control_min, self.state[:, 1:])
+        return reward
+
+
+class PreviewEnv(EpisodeEnv):
+    """`PreviewVectorEnv` as one environment. Version history: v0."""
+
+    batch = PreviewVectorEnv
