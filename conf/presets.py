@@ -10,6 +10,8 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
+from conf.messages import NameTaken, NotAllowed
+
 __all__ = [
     "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owners", "place",
     "program", "sentence",
@@ -41,7 +43,7 @@ def add(name: str, values: Mapping[str, Any], what: str) -> None:
     if group not in known:
         raise ValueError(f"{group} = {option}: no such group; allowed {', '.join(known)}")
     if option in known[group]:
-        raise ValueError(f"{group} = {option}: there is a preset of this name already; choose another")
+        raise NameTaken(what=f"preset {group} =", name=option)
     _added[name] = Added(dict(values), what)
 
 
@@ -149,7 +151,7 @@ def load(name: str) -> dict[str, Any]:
     group, _, option = name.rpartition("/")
     known = groups().get(group, [])
     if option not in known:
-        raise ValueError(f"{group} = {option}: allowed {', '.join(known)}")
+        raise NotAllowed(key=group, given=option, allowed=", ".join(known))
     text = None if name in _added else (ROOT / f"{name}.yaml").read_text(encoding="utf-8")
     own = dict(_added[name].values) if text is None else yaml.safe_load(text) or {}
     found: dict[str, Any] = {}

@@ -14,6 +14,8 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_da
 from difflib import get_close_matches
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
+from conf.messages import NoSuchKey, NotAllowed
+
 __all__ = ["Entry", "add", "build", "check", "entries", "part", "require", "setting"]
 
 T = TypeVar("T")
@@ -167,9 +169,9 @@ def _said(f: Any) -> dict[str, Any]:
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
-    """Check a rule, e.g. for several fields together. Raises: ValueError with the checker's message."""
+    """Check a rule, e.g. for several fields together. Raises: NotAllowed."""
     if not holds:
-        raise ValueError(f"{key} = {list(given) if isinstance(given, tuple) else given}: allowed {allowed}")
+        raise NotAllowed(key=key, given=list(given) if isinstance(given, tuple) else given, allowed=allowed)
 
 
 def check(config: Any, prefix: str = "") -> None:
@@ -202,7 +204,7 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
         moved = "; it is said under bench" if name in ON_BENCH else ""
         meant = "" if moved else _meant(name, default, prefix)
         where = f"under {above}" if above else "here"
-        raise ValueError(f"{key}: no such key{moved}{meant}; allowed {where}: {', '.join(of)}") from None
+        raise NoSuchKey(key=key, hint=f"{moved}{meant}", where=where, known=", ".join(of)) from None
 
 
 class _NoSuchKey(Exception):

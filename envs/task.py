@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.messages import NotAllowed
 from conf.schema import check, setting
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
@@ -31,7 +32,7 @@ def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
     Raises: ValueError if n < 2 or `maximum` is not positive.
     """
     if n < 2:
-        raise ValueError(f"number of pump rates = {n}: allowed >= 2 (the pump must be able to stop and to run)")
+        raise NotAllowed(key="number of pump rates", given=n, allowed=">= 2 (the pump must be able to stop and to run)")
     if not maximum > 0.0:
         raise ValueError(f"maximum pump rate = {maximum} mL/s: allowed > 0")
     return np.linspace(0.0, maximum, n)

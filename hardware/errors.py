@@ -1,7 +1,10 @@
 """Everything that can go wrong with a reactor, as one tree; catch `ReactorError` widely or a leaf narrowly.
 
-Every message names the thing, its value with unit, the allowed range and the remedy.
+Every message names the thing, its value with unit, the allowed range and the remedy. A leaf declares its sentence
+(`conf.messages`); the classes below also take a text.
 """
+
+from conf.messages import Message
 
 __all__ = [
     "DeviceStateError",
@@ -15,7 +18,7 @@ __all__ = [
 ]
 
 
-class ReactorError(Exception):
+class ReactorError(Message, Exception):
     """Base of all errors of this package."""
 
 

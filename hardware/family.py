@@ -21,11 +21,13 @@ from envs.bench import Bench
 from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
+from hardware import messages
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.clock import run_time
-from hardware.errors import DeviceStateError, LinkError, ReactorError, RecordingError, UnfitError
+from hardware.errors import LinkError, ReactorError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
+from hardware.storage.messages import JournalMissing
 
 __all__ = ["Can", "Check", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at", "report"]
 
@@ -53,7 +55,7 @@ def report(checks: Sequence[Check]) -> None:
         log.log(logging.INFO if one.ok else logging.WARNING, "%s", one)
     failed = [one for one in checks if one.required and not one.ok]
     if failed:
-        raise DeviceStateError(f"preflight: {len(failed)} of {len(checks)} checks failed, the first: {failed[0]}")
+        raise messages.PreflightFailed(count=len(failed), of=len(checks), first=failed[0])
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Opening:
     def earlier(self) -> list[dict[str, Any]]:
         """Return the rows of the run's earlier lives, none in a new run. Raises: RecordingError where they are gone."""
         if self.resumed and not self.journal.rows:
-            raise RecordingError(f"journal {self.journal.path}: missing or empty; put it back, or start a new run")
+            raise JournalMissing(path=self.journal.path)
         return self.journal.rows
 
     @property
@@ -103,11 +105,10 @@ class Opening:
         """Return the run time that has passed, s; 0 in a new run. Args: as of `run_time`, which is told if in doubt."""
         found = run_time(self.journal.rows, speed, low_s, high_s)
         if found.step_s:
-            moved = f"this computer's clock moved by {found.step_s / 60.0:.1f} min since the run's last row"
-            log.warning("%s: the run goes on at minute %.1f, without that step", moved, found.s / 60.0)
+            log.warning(messages.ClockMoved(by_min=found.step_s / 60.0, minute=found.s / 60.0))
             self.journal.append("clock", {"step_s": found.step_s, **found._asdict()})
         elif math.isinf(found.high_s):
-            log.warning("how long no program ran is known by this computer's clock alone, which may be wrong")
+            log.warning(messages.ClockDoubtful())
         return found.s
 
 
@@ -277,7 +278,7 @@ def not_looked_at(resumed: bool) -> Iterator[None]:
         yield
     except (KeyboardInterrupt, LinkError) as error:
         if resumed or not isinstance(error, LinkError):
-            log.warning("stopped before the pumps were looked at: pumps not verified off")
+            log.warning(messages.PumpsNotLookedAt())
         raise
 
 

@@ -4,7 +4,8 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hardware.reactor import Fault
+from conf.messages import Message
+from hardware.messages import Fault
 
 __all__ = ["Log", "Logbook", "no_log"]
 
@@ -33,7 +34,7 @@ class Logbook:
         self.name, self.elapsed = name, elapsed
         self.fault: Fault | None = None
         self.news = False
-        self.notes: list[str] = []
+        self.notes: list[Message] = []
         self._log, self._write = log, write
 
     def log(self, kind: str, **fields: Any) -> None:
@@ -44,19 +45,19 @@ class Logbook:
         """Write a row first. Raises: what the journal raises; then nothing is to be done."""
         self._write(kind, {"reactor": self.name, **fields})
 
-    def tell(self, note: str) -> None:
+    def tell(self, note: Message) -> None:
         """Write a note, and keep it for the next receipt."""
         self.notes.append(note)
-        self.log("note", note=note)
+        self.log("note", note=str(note), **note.row)
 
-    def say(self, note: str) -> None:
+    def say(self, note: Message) -> None:
         """Write a note and show it at once: of a wait, which no receipt would tell of before it is over."""
         screen.info("%s: %s", self.name, note)
-        self.log("note", note=note)
+        self.log("note", note=str(note), **note.row)
 
     def report(self, fault: Fault | None) -> None:
         """Set or clear the fault; a change of its kind is written."""
         before, self.fault = self.fault, fault
         if (before.kind if before else None) != (fault.kind if fault else None):
             self.news = True
-            self.log("fault", fault=str(fault) if fault else None)
+            self.log("fault", fault=str(fault) if fault else None, **(fault.row if fault else {}))

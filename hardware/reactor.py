@@ -13,32 +13,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware.errors import DeviceStateError, ReactorError
+from hardware.errors import ReactorError
+from hardware.messages import Fault, NotLeftOff
 
-__all__ = ["Command", "Fault", "KeepsLevels", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
+__all__ = ["Command", "KeepsLevels", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong with one reactor that it or its link reports: which kind, what was seen, what helps.
-
-    kind: link (no or no readable answer), selection (another client keeps choosing reactors), identity, absent,
-      restarted (the device lost its memory), stopped (its experiment was ended), stalled (it answers, its experiment
-      does not go on), mode (something else acts on its pumps), blank (its zero was changed), pump (not verified off),
-      overflow_pump (not verified on).
-    """
-
-    kind: str
-    detail: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.detail}; {self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -173,7 +156,7 @@ class KeepsLevels(Protocol):
 def left_off(reactors: Reactor) -> Iterator[None]:
     """Leave all pumps off and verified where this context ends by an error or a stop, or say that they are not.
 
-    Raises: what ended it; DeviceStateError naming the pumps that could not be verified off.
+    Raises: what ended it; NotLeftOff naming the pumps that could not be verified off.
     """
     try:
         yield
@@ -181,6 +164,6 @@ def left_off(reactors: Reactor) -> Iterator[None]:
         try:
             reactors.stop()
         except ReactorError as failed:
-            raise DeviceStateError(f"{str(error) or 'stopped'}; {failed}") from error
+            raise NotLeftOff(why=str(error) or "stopped", failed=failed) from error
         log.info("ended before the run began: pumps verified off")
         raise

@@ -10,8 +10,9 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from hardware.clock import Clock
-from hardware.errors import DeviceStateError, ReactorError
+from hardware.errors import ReactorError
 from hardware.logbook import Log, Logbook
+from hardware.messages import PumpsNotOff
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
 from hardware.storage.doses import Given
 from hardware.storage.history import History
@@ -261,19 +262,15 @@ class Stations(Generic[S, H]):
                 failed[station] = error
         return failed
 
-    def _not_off(self, failed: str) -> str:
-        """Word the report of pumps that could not be verified off."""
-        return failed
-
     def stop(self) -> None:
         """All pumps off, verified, but those of a reactor that was handed over; the rest goes on. Idempotent.
 
-        Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
+        Raises: PumpsNotOff naming every reactor whose pumps could not be verified off, and what to do.
         """
         failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
         self.note_down("stop", {"reactors": self.names, "not_verified": failed})
         if failed:
-            raise DeviceStateError(self._not_off("; ".join(failed)))
+            raise PumpsNotOff(failed="; ".join(failed))
 
     def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
         """All pumps of these off for good; what could not be verified."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hardware.messages import Fault
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
@@ -25,9 +26,9 @@ class WatchedSafety(SafetyConfig):
         """Take the limits of another config."""
         return cls(**{f.name: getattr(safety, f.name) for f in fields(safety)})
 
-    def response(self, kind: str) -> Response:
+    def response(self, fault: Fault | type[Fault]) -> Response:
         """See `SafetyConfig.response`; at most no dose for this sample."""
-        return min(super().response(kind), Response.HOLD)
+        return min(super().response(fault), Response.HOLD)
 
 
 class WatchedInterlock(Interlock):

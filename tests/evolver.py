@@ -20,10 +20,15 @@ from hardware import family
 from hardware.errors import DeviceStateError, LinkError, ProtocolError
 from hardware.family import Can, Family, Opening
 from hardware.logbook import Log
-from hardware.reactor import Array, Command, Fault, Mask, Measurement, Reactor, Receipt, Vitals, left_off
+from hardware.messages import Fault, LinkFault
+from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt, Vitals, left_off
 from hardware.storage.doses import Ending, damaged
 
 VIALS = 16
+
+
+class NoServer(LinkFault, says="{error}", remedy="check server and network"):
+    """The server of the vials does not answer."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +131,7 @@ class Evolver:
             self._k, self._now_s = int(new["k"]), float(new["t"])
             self._last = {key: np.array(new[key]) for key in self._last}
         except LinkError as error:
-            fault = Fault("link", str(error), "check server and network")
+            fault = NoServer(error=error)
         for n, name in enumerate(self.names if fault is None else ()):
             seen = {"od": self._last["od"][n], "temperature": self._last["celsius"][n], "raw": self._last["raw"][n]}
             self._log("sample", {"reactor": name, "time_s": self.elapsed(), "k": self._k, **seen})

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from conf import presets
+from conf.messages import NameTaken
 from conf.schema import build, entries
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
@@ -476,7 +477,7 @@ def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_
         {"start_od": 0.3}, f"The file {tmp_path}/my-vials.2.yaml."
     )  # fmt: skip
     assert "my_vials_2" in presets.options("deploy", "plant")
-    with pytest.raises(ValueError, match="^plant = bench: there is a preset of this name already; choose another"):
+    with pytest.raises(NameTaken):
         presets.add("plant/bench", {}, "")
     with pytest.raises(ValueError, match="^vials = mine: no such group; allowed .*, plant, "):
         presets.add("vials/mine", {}, "")

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.messages import NotAllowed
 from conf.schema import check, part, setting
 from envs.bench import Bench
 from envs.integrators import INTEGRATORS
@@ -126,7 +127,7 @@ class Plant:
         volume_ml: Array | float = Bench.volume_ml,
     ) -> None:
         if n < 1:
-            raise ValueError(f"number of vials = {n}: allowed >= 1")
+            raise NotAllowed(key="number of vials", given=n, allowed=">= 1")
         self.config, self.n = config, n
         parts = [r.spawn(7) for r in streams(rng, n)]
         once, process, reading, start, second, light, thermometer = ([p[k] for p in parts] for k in range(7))
@@ -171,9 +172,9 @@ class Plant:
         """
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)
         if not np.all(start >= 0.0):
-            raise ValueError(f"start OD = {start}: allowed >= 0")
+            raise NotAllowed(key="start OD", given=start, allowed=">= 0")
         if share is not None and not (np.all(np.asarray(share) >= 0.0) and np.all(np.asarray(share) <= 1.0)):
-            raise ValueError(f"start share = {share}: allowed 0 to 1")
+            raise NotAllowed(key="start share", given=share, allowed="0 to 1")
         self.thermal.reset(self.config.start_temperature if temperature is None else temperature)
         self.culture.reset(start, self.thermal.temperature, share)
         self.vessel.reset()
@@ -215,7 +216,7 @@ class Plant:
         above = np.broadcast_to(np.asarray(overflow_s, dtype=np.float64), (self.n,))
         if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste + above)):
             given = f"feed {feed} s, waste {waste} s, overflow {above} s"
-            raise ValueError(f"pump on-time = {given}: allowed finite numbers")
+            raise NotAllowed(key="pump on-time", given=given, allowed="finite numbers")
         if temperature_target is not None:
             self.thermal.set_target(temperature_target)
         pieces = max(1, int(np.ceil(minutes - 1e-9)))

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import is_dataclass
 from typing import Any
 
+from conf.messages import NotAllowed
 from conf.presets import chosen, opening, options, sentence
 from conf.schema import entries
 
@@ -127,7 +128,7 @@ def text(name: str, config: Any, about: str = "") -> str:
         return "\n".join([*opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])
     parts = _parts(name, config)
     if about not in parts:
-        raise ValueError(f"--help = {about}: allowed all, {', '.join(parts)}")
+        raise NotAllowed(key="--help", given=about, allowed=f"all, {', '.join(parts)}")
     inner = parts[about]
     values = _values(inner, f"{about}.") if inner is not None else ()
     return "\n".join([*groups.get(about, []), *([""] if about in groups and inner is not None else []), *values])

@@ -14,6 +14,7 @@ from types import FrameType, TracebackType
 from typing import ParamSpec, TypeVar
 
 from experiments.cli import extensions
+from experiments.cli.messages import PumpsBeingEnded
 
 __all__ = [
     "SIGNALS", "STATUS", "Pause", "Workers", "handled", "heard", "interrupts", "one_interrupt", "pausing",
@@ -128,7 +129,7 @@ def one_interrupt() -> Iterator[None]:
 
     def answer(number: int, stack: FrameType | None) -> None:
         if _arrives():
-            log.warning("the pumps are being switched off and verified; this takes up to a minute")
+            log.warning(PumpsBeingEnded())
         else:
             _interrupt(number, stack)
 

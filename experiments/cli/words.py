@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from conf import presets
+from conf.messages import Message
 from experiments.cli import extensions, latest
 
 __all__ = ["EXTRA", "RUN", "UserError", "normalise", "refusing", "resumed"]
@@ -15,7 +16,7 @@ RUN = "hydra.run.dir="
 EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 
 
-class UserError(Exception):
+class UserError(Message, Exception):
     """Error that the user can correct; only its message, one line, is shown."""
 
 

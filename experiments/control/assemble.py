@@ -24,6 +24,7 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.cli.calibrated import read_env_file, read_plant_file
 from experiments.cli.files import choices
+from experiments.control import messages
 from experiments.control.config import DeployConfig
 from experiments.control.guests import GUESTS
 from experiments.control.policies import WantedPolicy, admit, policy_check, run_policy
@@ -113,15 +114,14 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         scenarios, ends = config.schedules(), config.ends()
     if resumed and not family.can.resume:
         why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
-        raise frame.UserError(f"resume={config.resume}: {why}")
+        raise messages.CannotResume(run=config.resume, why=why)
     bench, (plant, model) = config.bench, _models(config)
     volumes_ml = bench.volumes(backend.reactors)
     if family.simulated and (other_ml := plant.vessel.volume_ml) is not None and (volumes_ml != other_ml).any():
-        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL or bench.volumes_ml, which everything else goes by"
-        log.info("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
+        log.info(messages.VolumesDiffer(other_ml=other_ml, volume_ml=bench.volume_ml))
     usual = PlantConfig(), build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
     if not family.simulated and config.plant not in usual:
-        log.warning("plant: backend=%s has vials of its own, plant.* changes nothing there", config.backend.kind)
+        log.warning(messages.PlantIgnored(backend=config.backend.kind))
     _check_fit(config, family, scenarios, ends)
     further = _further(config, plant, folder, scenarios)
     if any(signal.sees_light for signal in further):  # the device has to measure it
@@ -168,8 +168,7 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
         try:
             registry.on_device(law)
         except ValueError:
-            remedy = f"allowed with backend=sim only, not backend={kind}"
-            raise frame.UserError(f"controller = {law}: knows a simulated plant; {remedy}") from None
+            raise messages.KnowsThePlant(controller=law, backend=kind) from None
     with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
         _check_room(config, family)
@@ -220,7 +219,7 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
         for signal in made:
             pump, key = actuators[signal.actuator].pump if signal.actuator else 0, f"signals.{signal.name}"
             if pump and any(pump in s.supplied for s in scenarios):
-                raise frame.UserError(f"{key}: pump {pump} is in scenario.outputs, too; allowed one of them")
+                raise messages.PumpTwice(key=key, pump=pump)
             family.gives(config.backend, config.bench, [{pump} - {0}] * len(scenarios), key)
         return made
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from conf.messages import NotAllowed
 from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
@@ -99,7 +100,8 @@ class DeployConfig:
         for name in self.backend.reactors:
             given = self.each.get(name, {})
             if not isinstance(given, dict):
-                raise ValueError(f"each.{name} = {given}: allowed keys and values, as each.{name}.minutes=[90]")
+                allowed = f"keys and values, as each.{name}.minutes=[90]"
+                raise NotAllowed(key=f"each.{name}", given=given, allowed=allowed)
             own = {k: v for k, v in given.items() if k not in OF_RUN}
             wrong = set(own) - {f.name for f in fields(Scenario)}
             if wrong:

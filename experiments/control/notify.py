@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 
 from experiments.cli import frame
 from experiments.cli.outlet import Outlet
+from experiments.control import messages
 
 __all__ = ["HOOK", "Hook", "Notifier", "hidden", "opened"]
 
@@ -62,14 +63,13 @@ class Hook:
                 if parts.hostname:
                     self.name = f"{parts.scheme}://{parts.hostname}/…"
                     return
-            raise frame.UserError("notify: the address has no host; allowed https://HOST/...")
+            raise messages.NoHost()
         try:
             self._command = shlex.split(target)
         except ValueError as error:
-            remedy = "allowed a command, https://... or env:NAME"
-            raise frame.UserError(f"notify: the command cannot be read ({error}); {remedy}") from None
+            raise messages.NoCommand(why=f"the command cannot be read ({error})") from None
         if not self._command or shutil.which(self._command[0]) is None:
-            raise frame.UserError("notify: there is no such command; allowed a command, https://... or env:NAME")
+            raise messages.NoCommand(why="there is no such command")
         self.name = Path(self._command[0]).name
 
     def send(self, line: bytes) -> str:
@@ -128,13 +128,13 @@ class Notifier:
         message = {"event": event, "time": at, "run": self._run, "reactor": reactor, "text": text}
         line = json.dumps({k: v for k, v in message.items() if v}).encode() + b"\n"
         if not self._outlet.put(line) and self.dropped == 1:
-            log.warning("notify: messages are dropped, the hook does not keep up")
+            log.warning(messages.HookDropping())
 
     def _send(self, hook: Hook, line: bytes) -> None:
         problem = hook.send(line)
         self.sent, self.failed = self.sent + (not problem), self.failed + bool(problem)
         if problem and self.failed == 1:
-            log.warning("notify: %s did not take a message (%s); the run goes on", hook.name, problem)
+            log.warning(messages.HookFailed(hook=hook.name, why=problem))
 
     def close(self) -> None:
         """Wait a few seconds for what is still queued, then give it up; say how many messages arrived. Idempotent."""
@@ -143,10 +143,8 @@ class Notifier:
         left, dropped = self._outlet.close(LAST_S), self.dropped
         self._hook.give_up()
         self._outlet = None
-        log.info(
-            "notify: %s took %d messages; %d failed, %d were dropped, %d were left at the end",
-            self._hook.name, self.sent, self.failed, dropped, left,
-        )  # fmt: skip
+        counts = {"sent": self.sent, "failed": self.failed, "dropped": dropped, "left": left}
+        log.info(messages.HookTally(hook=self._hook.name, **counts))
 
 
 def opened(target: str, run: Path, resumed: bool) -> Notifier:
@@ -159,14 +157,13 @@ def opened(target: str, run: Path, resumed: bool) -> Notifier:
         name = target.removeprefix("env:")
         target = os.environ.get(name, "").strip()
         if not target:
-            missing = f"notify=env:{name}: the environment has no {name}; set it to a command or an address"
             if not resumed:
-                raise frame.UserError(missing)
-            log.warning("%s, then resume again; until then nobody is told", missing)
+                raise messages.NotSet(name=name)
+            log.warning(messages.HookUnusable(why=messages.NotSet(name=name)))
     try:
         return Notifier(Hook(target) if target else None, run)
     except frame.UserError as error:
         if not resumed:
             raise
-        log.warning("%s; mend it, then resume again; until then nobody is told", error)
+        log.warning(messages.HookUnusable(why=error))
         return Notifier(None, run)

@@ -18,6 +18,7 @@ from experiments.certification import certificate
 from experiments.certification.certificate import Opinion
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
+from experiments.control import messages
 from experiments.laws.density.learned import settings
 from hardware.family import Check
 from hardware.storage import atomic
@@ -115,7 +116,7 @@ def find_policy(name: str) -> Path:
     Raises: UserError saying what to give instead.
     """
     if not name.strip():
-        raise frame.UserError("policy is empty: give policy=latest, shipped, a run folder or a policy.npz")
+        raise messages.NoPolicyNamed()
     if name == "shipped":
         return SHIPPED
     if name == "latest":
@@ -136,7 +137,7 @@ def readable(path: Path) -> Iterator[None]:
         raise frame.UserError(str(error)) from None
     except Exception as error:  # whatever a damaged file makes NumPy say
         why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
+        raise messages.PolicyDamaged(path=path, why=why) from None
 
 
 def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
@@ -154,15 +155,9 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         seen = ", ".join(policy.observation)
         raise frame.UserError(f"policy {path} observes {seen}; give a policy of env=sim or env=relative")
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
-        raise frame.UserError(
-            f"policy {path} was trained for a control period of {training.control_min} min, "
-            f"the backend has {control_min} min; train with env.control_min={control_min}"
-        )
+        raise messages.OtherPeriod(path=path, own_min=training.control_min, asked_min=control_min)
     if not fastest <= max_rate + 1e-12:
-        raise frame.UserError(
-            f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
-            "train with a smaller env.max_pump_rate or raise bench.max_rate"
-        )
+        raise messages.PumpsTooMuch(path=path, own=fastest, most=max_rate)
     log.info("policy %s: %s", path, training)
     return policy
 
@@ -175,9 +170,9 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
     """
     found = _judged(policy, file, wanted)
     if found.refused and not resumed and wanted.refuses:
-        raise frame.UserError(f"policy refused: {'; '.join(found.refused + found.short)}; {FORCE}")
+        raise messages.PolicyRefused(why="; ".join(found.refused + found.short), help=FORCE)
     for reason in found.refused + found.short:
-        log.warning("policy: %s", reason)
+        log.warning(messages.PolicyDoubtful(why=reason))
 
 
 def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:

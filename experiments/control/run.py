@@ -12,12 +12,13 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from experiments.cli import files, frame, outlet
 from experiments.cli.frame import swept
 from experiments.cli.stop import heard, one_interrupt
-from experiments.control import assemble, notify
+from experiments.control import assemble, messages, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.signals import Draws
+from experiments.record.messages import AlarmsTold
 from experiments.record.record import Record
 from experiments.record.summary import (
     ChangeLog,
@@ -70,21 +71,22 @@ class BenchMarks:
             journal.append("level", {"reactor": mark.reactor, "level_ml": mark.level_ml})
             if known:
                 before = loop.set_level(mark.reactor, mark.level_ml)
-                log.info("%s: %.1f mL in the vial by its mark, %.1f by the ledger", mark.reactor, mark.level_ml, before)
+                log.info(messages.LevelMarked(reactor=mark.reactor, level_ml=mark.level_ml, ledger_ml=before))
         if mark.bottle_ml is not None:
             journal.append("bottle", {"reactor": mark.reactor, "bottle_ml": mark.bottle_ml})
             if known:
                 loop.refilled(mark.reactor, mark.bottle_ml)
-                log.info("%s: %.0f mL in the bottle by its mark; doses go on", mark.reactor, mark.bottle_ml)
+                log.info(messages.BottleMarked(reactor=mark.reactor, bottle_ml=mark.bottle_ml))
         if mark.share is not None and mark.sd is not None:
             counted = mark.share, mark.sd, mark.time_min
             journal.append(
                 "share", {"reactor": mark.reactor, **dict(zip(("share", "sd", "minute"), counted, strict=True))}
             )
             if known:
-                said = f"{mark.reactor}: share {mark.share:g} +- {mark.sd:g} at minute {mark.time_min:.0f} by its mark"
                 answer, doubtful = loop.counted(mark.reactor, *counted)
-                log.log(logging.WARNING if doubtful else logging.INFO, "%s, %s", said, answer)
+                share, sd, minute = counted
+                told = messages.ShareMarked(reactor=mark.reactor, answer=answer, share=share, sd=sd, minute=minute)
+                log.log(logging.WARNING if doubtful else logging.INFO, told)
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
@@ -114,9 +116,9 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
             reactors.stop()
             left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
             if isinstance(reactors, Watched):
-                log.info("only watched: nothing was switched")
+                log.info(messages.OnlyWatched())
             else:
-                log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
+                log.info(messages.PumpsOff(left=f"; {left}: left to the on-board regulation" if left else ""))
         except ReactorError as error:
             outcome = f"failed: {error}"
     return outcome
@@ -143,12 +145,11 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         files.write_json(folder / "summary.json", summary)
         record.curves.end(summary, setup.row, pictures)
     except OSError as error:
-        why = f"figure and summary not written ({error.strerror or error})"
-        return f"failed: {outcome.removeprefix('failed: ')}; {why}"
+        return str(messages.DiskFull(outcome=outcome.removeprefix("failed: "), why=error.strerror or error))
     log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
     for name, rows in zip(record.names, record.rows, strict=True):
         if line := reasons_line(rows):
-            log.warning("%s: the interlock told: %s", name, line)
+            log.warning(AlarmsTold(reactor=name, kinds=line))
     what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
     if signals := signals_table(summary["windows"]):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from conf import presets
+from conf.messages import NotAllowed
 from envs.bench import Bench
 from experiments.laws.density.baselines import (
     GainScheduled,
@@ -115,7 +116,7 @@ def _kind(kind: str, signal: str) -> LawKind:
     if kind not in held.kinds:
         missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(SIGNALS)}"
         key = f"{held.key or f'signals.{signal}'}.kind"
-        raise ValueError(f"{key} = {kind}: allowed {', '.join(held.kinds) or missing}")
+        raise NotAllowed(key=key, given=kind, allowed=", ".join(held.kinds) or missing)
     return held.kinds[kind]
 
 
@@ -128,7 +129,7 @@ def on_device(kind: str) -> str:
     """Return the law of the density, if it needs no simulated plant. Raises: ValueError naming those that do not."""
     known = [name for name, law in KINDS.items() if "plant" not in law.parts]
     if kind not in known:
-        raise ValueError(f"controller_kind = {kind}: allowed {', '.join(known)}")
+        raise NotAllowed(key="controller_kind", given=kind, allowed=", ".join(known))
     return kind
 
 

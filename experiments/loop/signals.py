@@ -12,11 +12,13 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.messages import NameTaken
 from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.preview import half_way
 from envs.scenario import Scenario
 from experiments.laws.base import Accounts, Array, Controller, Estimates, Explains, Mask, Watches
+from experiments.loop import messages
 from hardware.actuator import FEED, Actuator
 from hardware.memory import Remembers
 from hardware.reactor import Measurement
@@ -25,7 +27,6 @@ from hardware.safety.interlock import Interlock
 __all__ = [
     "AIM",
     "ESTIMATED",
-    "FILTER_ALARM",
     "TRUE",
     "Counted",
     "Density",
@@ -44,7 +45,6 @@ __all__ = [
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
 AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
-FILTER_ALARM = "filter_alarm"  # in a row; on the screen the supervisor's beginning and end are said
 PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "journal_row")
 
@@ -246,9 +246,9 @@ class Density:
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
         warnings: list[str | None] = [None] * sample.rows.size
-        for key, then in (("noted", "the policy goes on"), ("alarm", "the law on a second filter decides")):
+        for key, then in (("noted", "the policy goes on"), ("alarm", "the controller on a second filter decides")):
             for n in np.flatnonzero(why.get(key, np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))):
-                warnings[n] = f"filter_alarm: readings do not fit the estimate; reported; {then}"
+                warnings[n] = messages.FilterAlarm(then=then).line("reported")
         return Findings(why=why, warnings=warnings if any(warnings) else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
@@ -283,14 +283,14 @@ def add(name: str, make: Make) -> None:
     Raises: ValueError for a name that is taken.
     """
     if name in (*TAKEN, *MAKERS):
-        raise ValueError(f"signal {name}: there is one of this name already; choose another")
+        raise NameTaken(what="signal", name=name)
     MAKERS[name] = make
 
 
 def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
     """Build a signal of an extension. Raises: ValueError naming the signals there are, or what does not fit."""
     if name not in MAKERS:
-        raise ValueError(f"signals.{name}: no such signal; allowed {', '.join(MAKERS) or 'those of extend=FILE.py'}")
+        raise messages.NoSuchSignal(name=name, known=", ".join(MAKERS) or "those of extend=FILE.py")
     return MAKERS[name](config, schedules)
 
 
@@ -298,7 +298,7 @@ def shaped(values: Array, n: int, what: str) -> Array:
     """Check that there is one value for each reactor; return them. Raises: ValueError naming what they are."""
     found = np.asarray(values)
     if found.shape != (n,):
-        raise ValueError(f"{what} has the shape {found.shape}: allowed ({n},), one value for each reactor")
+        raise messages.WrongShape(what=what, shape=found.shape, n=n)
     return found
 
 
@@ -310,10 +310,10 @@ def fitting(signals: Sequence[Signal], actuators: Sequence[Actuator]) -> list[Si
     known = [actuator.name for actuator in actuators]
     for k, signal in enumerate(signals):
         if missing := [part for part in PARTS if not hasattr(signal, part)]:
-            raise ValueError(f"signal {signal.name} has no {', '.join(missing)} (docs/extending.md, A signal)")
+            raise messages.PartMissing(name=signal.name, parts=", ".join(missing))
         if signal.actuator and signal.actuator not in known:
-            raise ValueError(f"{signal.name} acts by the {signal.actuator}: these reactors have {', '.join(known)}")
+            raise messages.NoActuator(name=signal.name, actuator=signal.actuator, known=", ".join(known))
         for other in signals[:k]:
             if signal.actuator and signal.actuator == other.actuator:
-                raise ValueError(f"{other.name} and {signal.name} act by the same {signal.actuator}: allowed one")
+                raise messages.ActuatorTaken(one=other.name, other=signal.name, actuator=signal.actuator)
     return list(signals)

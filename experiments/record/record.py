@@ -15,20 +15,21 @@ from typing import Any
 
 import numpy as np
 
+from conf.messages import Message
 from experiments.cli import files
 from experiments.loop.loop import Step
+from experiments.record import messages
 from experiments.record.curves import Curves
 from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, Rows, at_end, complete, read_rows, row_of
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
 from hardware.storage.marks import Mark, read_marks
+from hardware.storage.messages import NotWritten
 from hardware.storage.recorder import Recorder
 
 __all__ = ["Record", "Recordings"]
 
 log = logging.getLogger(__name__)
-
-AFTERWARDS = "resume=RUN writes it anew from the journal once the run has ended"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ class Recordings:
     names: tuple[str, ...]
     columns: Mapping[str, Array]
     rows: Sequence[Rows]
-    repairs: Sequence[str]
+    repairs: Sequence[Message]
     marks: Sequence[Mark]
 
     def od(self, refused: bool = False) -> Array:
@@ -61,7 +62,7 @@ class Record:
       folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
       fsync: each row on the disk before the call returns, and its curves visible. columns: of the recordings.
     Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
-      mended on opening, one line each.
+      mended on opening.
     Raises: RecordingError.
     """
 
@@ -78,7 +79,7 @@ class Record:
             raise
 
     def _continue(self, columns: Sequence[str]) -> None:
-        self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
+        self.repairs: list[Message] = [messages.TornJournal(length=self.journal.cut)] if self.journal.cut else []
         paths = [self.folder / "recordings" / f"{name}.csv" for name in self.names]
         self._recorders = [Recorder(path, columns, self._fsync, REBUILD) for path in paths]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
@@ -106,9 +107,9 @@ class Record:
                 self._recorders[n].amend(row)
                 self.rows[n] = read_rows(self._paths[n], self.columns)
 
-    def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Complete recordings from the rows of the journal; return a line for each."""
-        lines = []
+    def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[Message]:
+        """Complete recordings from the rows of the journal; return a message for each."""
+        lines = list[Message]()
         for n, name in enumerate(self.names):
             lines += complete(journal, name, self.rows[n], partial(self._write, n))
         return lines
@@ -133,15 +134,14 @@ class Record:
             self._write(n, row_of(step, n))
             if (path := self._paths[n]) not in self._gone and self._recorders[n].gone:
                 self._gone.add(path)
-                log.warning("%s: deleted or moved in the run; %s", path, AFTERWARDS)
+                log.warning(messages.RecordingGone(path=path))
         try:
             self.curves.step(step)
             if self._fsync:
                 self.curves.flush()
             self.save(state)
         except OSError as error:
-            remedy = "free disk space, then resume the run"
-            raise RecordingError(f"{self.folder}: {error.strerror or error}; {remedy}") from error
+            raise NotWritten(path=self.folder, why=error.strerror or error) from error
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""

@@ -17,14 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.messages import Message
 from experiments.loop.loop import ClosedLoop, Step
+from experiments.record import messages
 from hardware.actuator import FEED
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
 from hardware.storage.doses import dosed
-from hardware.storage.journal import REMEDY, Journal
+from hardware.storage.journal import Journal
+from hardware.storage.messages import RowDamaged
 
 __all__ = [
     "COLUMNS", "REBUILD", "Row", "at_end", "complete", "continue_loop", "is_over", "load_state", "read_rows", "row_of",
@@ -35,8 +38,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Row = dict[str, float | int | str | bool | None]
 
-ANEW = "it is written anew from the last 20 MB of the journal"
-REBUILD = f"move it away and resume again: {ANEW}"
+REBUILD = messages.RecordingDamaged.remedy
 COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
@@ -112,7 +114,7 @@ def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
     try:
         file = open(path, newline="", encoding="utf-8")  # noqa: SIM115 (closed below)
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}; resume the run: {ANEW}") from None
+        raise messages.RecordingUnreadable(path=path, why=error.strerror) from None
     with file as f:
         rows = csv.DictReader(f)
         try:
@@ -121,24 +123,26 @@ def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
                     raise ValueError("a row without a time, or not with a cell for every column")
                 found.append({key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
         except (ValueError, csv.Error) as error:
-            raise RecordingError(f"{path}: damaged near line {max(rows.line_num, 1)} ({error}); {REBUILD}") from None
+            raise messages.RecordingDamaged(path=path, line=max(rows.line_num, 1), why=error) from None
     return found
 
 
-def complete(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write: Callable[[Row], None]) -> list[str]:
+def complete(
+    journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write: Callable[[Row], None]
+) -> list[Message]:
     """Write the rows of reactor `name` that are in the journal and that a kill kept from being written.
 
     Args: journal: its rows. rows: those already written, into which `write` takes each new one.
-    Returns: one line per row. Raises: RecordingError for a row of the journal that was damaged.
+    Returns: one message per row. Raises: RecordingError for a row of the journal that was damaged.
     """
-    repairs = []
+    repairs = list[Message]()
     try:
         for row in _unwritten(journal, name, rows):
             write(row)
-            repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+            repairs.append(messages.RowCompleted(reactor=name, minute=row["time_min"]))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
-        raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
+        raise RowDamaged(path="journal.jsonl", what=what) from None
     return repairs
 
 
@@ -236,8 +240,7 @@ def load_state(path: Path) -> dict[str, Any]:
 
 
 def _no_state(path: Path, why: str) -> RecordingError:
-    remedy = "journal and recordings are kept; start a new run, or put back the file as the run wrote it"
-    return RecordingError(f"{path}: no state to resume from ({why}); {remedy}")
+    return messages.NoState(path=path, why=why)
 
 
 def is_over(journal: Journal, path: Path) -> bool:
@@ -295,8 +298,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
     shares = [row for row in journal.rows if row["kind"] == "share" and row["reactor"] in names]
     counted = [(names.index(s["reactor"]), float(s["share"]), float(s["sd"]), float(s["minute"])) for s in shares]
     loop.retell([r.columns for r in rows], counted)
-    minute = loop.reactors.elapsed() / 60.0
-    log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
+    log.info(messages.Resumed(minute=loop.reactors.elapsed() / 60.0, doses=len(doses)))
 
 
 def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: list[str]) -> dict[str, Any]:

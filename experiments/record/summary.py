@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
 from experiments.loop.loop import ClosedLoop, Step
+from experiments.loop.messages import FilterAlarm
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
-from experiments.loop.signals import AIM, FILTER_ALARM
+from experiments.loop.signals import AIM
+from experiments.record import messages
 from experiments.record.record import Recordings
 from experiments.record.recovery import Rows
 from experiments.reporting import charts
@@ -65,7 +67,7 @@ class ChangeLog:
         """Log what is new in this step."""
         for n, name in enumerate(self._names):
             if step.ended is not None and step.ended[n]:
-                log.info("%s: %s at OD %.3f", name, self._ended(step, n), step.od[n])
+                log.info(self._ended(step, n))
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._window(step, n)
                 self._phase[n] = int(step.phase[n])
@@ -73,7 +75,7 @@ class ChangeLog:
                 for signal in signals_in([step.columns]):
                     asked = step.columns[f"{signal}_setpoint"][n]
                     what += f", {CALLED.get(signal, signal)} {asked:g}" if np.isfinite(asked) else ""
-                log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
+                log.info(messages.PhaseBegins(reactor=name, what=what, minute=step.minute[n], od=step.od[n]))
             if step.rows[n]:
                 self._who_decides(step, n)
                 if step.done[n]:
@@ -85,14 +87,14 @@ class ChangeLog:
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
             named = kinds_of(reason)
-            kinds = " ".join(k for k in named if k != FILTER_ALARM) if named else reason
+            kinds = " ".join(k for k in named if k != FilterAlarm.kind) if named else reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
-                said = step.reasons[n] or "interlock: all well again"
+                said = step.reasons[n] or messages.WellAgain()
                 log.warning("%s: %s", name, said)
-                self._tell("alarm", said, name)
+                self._tell("alarm", str(said), name)
         for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
-            self._tell("hand_over", "the device regulates by itself from now on", self._names[n])
+            self._tell("hand_over", str(messages.LeftToDevice()), self._names[n])
         self._handed_over = self._reactors.handed_over.copy()
         self.notes(step.now_s, step.notes)
 
@@ -103,19 +105,20 @@ class ChangeLog:
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))
             if now_s >= told_s + AGAIN_S or largest >= 2.0 * before > 0.0:
                 self._noted[kind] = now_s, largest
-                log.info("%s (noted here once an hour, every time in the journal)", note)
+                log.info(messages.NoteSeen(note=note))
 
-    def _ended(self, step: Step, n: int) -> str:
-        """Which step of reactor n's schedule this sample ended, and why."""
+    def _ended(self, step: Step, n: int) -> messages.StepEnded:
+        """Say which step of reactor n's schedule this sample ended, and why."""
         k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
         start, end, _ = self._progress.steps(n)[k]
-        return f"step {k + 1} ended after {end - start:.0f} min: {self._progress.conditions.texts[n][k]}"
+        why = self._progress.conditions.texts[n][k]
+        return messages.StepEnded(reactor=self._names[n], step=k + 1, minutes=end - start, why=why, od=step.od[n])
 
     def _window(self, step: Step, n: int) -> None:
         """How well the window was held that ends with this step."""
         if self._samples[n]:
             mean = self._error[n] / self._samples[n]
-            log.info("%s: window ends at minute %.0f, mean error %.4f OD", self._names[n], step.minute[n], mean)
+            log.info(messages.WindowEnds(reactor=self._names[n], minute=step.minute[n], error=mean))
         self._error[n] = self._samples[n] = 0.0
 
     def _who_decides(self, step: Step, n: int) -> None:
@@ -123,9 +126,9 @@ class ChangeLog:
         supervised = bool(step.explanation.get("supervised", np.zeros(len(self._names)))[n])
         if supervised != self._supervised[n]:
             self._supervised[n] = supervised
-            who = "the supervisor's law acts, the estimate is in doubt," if supervised else "the policy acts again"
-            log.info("%s: %s from minute %.0f", self._names[n], who, step.minute[n])
-            self._tell("hand_over", f"{who} from minute {step.minute[n]:.0f}", self._names[n])
+            acts = (messages.SupervisorActs if supervised else messages.PolicyActs)(minute=step.minute[n])
+            log.info(acts.about(self._names[n]))
+            self._tell("hand_over", str(acts), self._names[n])
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
@@ -176,7 +179,7 @@ def summarise(
         "windows": _windows(table, scenarios, progress or Progress(scenarios)),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
-        "repairs": list(table.repairs),
+        "repairs": [str(repair) for repair in table.repairs],
         "marks": [asdict(mark) for mark in table.marks],
     }
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from conf import presets
+from conf.messages import NameTaken
 from dqn.agent import STREAMS, DQNAgent
 from dqn.config import DQNConfig
 from dqn.trainer import Agent
@@ -62,7 +63,7 @@ def add(
     Raises: ValueError for a kind that exists.
     """
     if kind in AGENTS:
-        raise ValueError(f"agent {kind}: there is one of this name already; choose another")
+        raise NameTaken(what="agent", name=kind)
     presets.add(f"agent/{kind}", {"kind": kind}, what)
     AGENTS[kind], KINDS[config] = config, AgentKind(make, tuple(streams))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from conf import presets
+from conf.messages import NameTaken, NotAllowed
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.preview import PreviewConfig
@@ -52,7 +53,7 @@ def add(
     Raises: ValueError for a kind that exists.
     """
     if kind in ENVS:
-        raise ValueError(f"env {kind}: there is one of this name already; choose another")
+        raise NameTaken(what="env", name=kind)
     if what:
         presets.add(f"env/{kind}", {"kind": kind}, what)
     ENVS[kind], TASKS[config] = config, TaskKind(task, completed, repeats)
@@ -61,7 +62,7 @@ def add(
 def env_schema(kind: str, key: str = "env") -> Any:
     """Return the default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
     if kind not in ENVS:
-        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(ENVS)}")
+        raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(ENVS))
     return ENVS[kind]()
 
 
@@ -71,7 +72,7 @@ AGENTS: dict[str, type[Any]] = {"dqn": DQNConfig}
 def agent_schema(kind: str, key: str = "agent") -> Any:
     """Return the default config of an agent of this kind, "": dqn. Raises: ValueError naming the kinds there are."""
     if (kind or "dqn") not in AGENTS:
-        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(AGENTS)}")
+        raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(AGENTS))
     return AGENTS[kind or "dqn"]()
 
 

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from hardware.chibio import messages
 from hardware.chibio.protocol import PUMPS, WASTE, DeviceState, Permitted, check_command, parse_state
 from hardware.clock import Clock
-from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
+from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, no_log
 
@@ -29,10 +30,10 @@ def identity(transport: Transport, clock: Clock, where: str) -> str:
     """
     reply = transport.get("/getSysdata/")
     if reply.status != 200:
-        raise ProtocolError(f"{where}: GET /getSysdata/: status {reply.status}, expected 200; check the address")
+        raise messages.WrongStatus(request=f"{where}: GET /getSysdata/", status=reply.status, expected=200)
     present = parse_state(reply.body).present
     if not present:
-        raise DeviceStateError("the device has no reactor; plug one in with the server stopped")
+        raise messages.NoReactor()
     return Connection(present[0], Permitted(present[:1]), transport, clock, no_log).read().device_id
 
 
@@ -83,13 +84,11 @@ class Connection:
             if state.selected == self.name and ours:
                 break
         if state.selected != self.name:
-            why = f"the device shows {state.selected}; another client keeps selecting reactors"
-            raise DeviceStateError(f"{self.name} cannot be read: {why}")
+            raise messages.CannotBeRead(reactor=self.name, shown=state.selected)
         if not ours:  # nor the times before: one answer may be garbled on its way
             self.state = None
-            raise IdentityError(
-                f"{self.name} answers with identity {state.device_id or 'none'}, pinned is {self.device_id or 'none'}"
-            )
+            found, pinned = state.device_id or "none", self.device_id or "none"
+            raise messages.OtherIdentity(reactor=self.name, found=found, pinned=pinned)
         self.device_id = state.device_id
         self.state, self.took_s = state, self._since(start)
         return state
@@ -102,7 +101,7 @@ class Connection:
         before, self._unsure = self._unsure, True
         reply = self._transport.get("/getSysdata/")
         if reply.status != 200:
-            raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
+            raise messages.WrongStatus(request="GET /getSysdata/", status=reply.status, expected=200)
         self._unsure = before  # only the server answers 200, even if the body is garbled
         state = parse_state(reply.body)
         self._unsure = False
@@ -112,10 +111,10 @@ class Connection:
             and (last.selected, last.start_time) == (state.selected, state.start_time)
             and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # else the board's clock
         ):
-            raise LinkError("an answer of an earlier time came again; look for a proxy or tunnel that keeps answers")
+            raise messages.OldAnswer()
         if self.name not in state.present:
             self.state = None  # nothing is sent to it from now on
-            raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
+            raise messages.Absent(reactor=self.name, present=", ".join(state.present) or "none")
         self._seen_s = self.clock.now()
         return state
 
@@ -128,7 +127,7 @@ class Connection:
         if self.state is not None and (self._unsure or self.clock.now() - self._seen_s > SEEN_S):
             self._look()
         if self.state is None or self.name not in self.state.present:
-            raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
+            raise messages.NotSent(path=path, reactor=self.name)
         self._post(path)
         self._seen_s = self.clock.now()
 
@@ -159,8 +158,7 @@ class Connection:
                     "command", {"reactor": self.name, "path": path, "answer": answer, "took_s": self._since(start)}
                 )
         if reply.status != 204:
-            hint = "; the server wants X-Requested-With" if reply.status == 403 else ""
-            raise ProtocolError(f"POST {path}: status {reply.status}, expected 204{hint}")
+            raise messages.WrongStatus(request=f"POST {path}", status=reply.status, expected=204)
         self._unsure = before
 
     def _since(self, start: float) -> float:
@@ -225,13 +223,13 @@ class Connection:
             except (LinkError, ProtocolError) as failed:
                 error = failed
                 continue
-            why = f" ({refused})" if refused else ""
             named = ", ".join(pump for pump in on if pump != WASTE or on == [WASTE])
-            error = DeviceStateError(f"{self.name}: {named} still on after the off command{why}")
+            why = f" ({refused})" if refused else ""
+            error = messages.StillOn(reactor=self.name, pumps=named, refused=why)
         assert error is not None
         if isinstance(error, DeviceStateError):
             raise error
-        raise type(error)(f"{', '.join(left or pumps)} not verified off: {error}")
+        raise error.about(f"{', '.join(left or pumps)} not verified off")
 
     def drain(self) -> None:
         """Waste pump on, where a feed pump may run or has run without it. Raises: as `post`."""

@@ -2,10 +2,11 @@
 
 import math
 
+from hardware.chibio import messages
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.protocol import DeviceState
 from hardware.errors import DeviceStateError, IdentityError, ReactorError
-from hardware.reactor import Fault
+from hardware.messages import Fault
 
 __all__ = ["describe", "diagnose", "fault_of", "regulates"]
 
@@ -22,7 +23,7 @@ def describe(state: DeviceState) -> str:
 
 def diagnose(
     state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
-    dosing: bool, stuck: str, ended: str, overflow_trouble: str,
+    dosing: bool, stuck: str, ended: str, overflow_trouble: Fault | None,
 ) -> Fault | None:  # fmt: skip
     """Find the gravest fault that a verified state shows, against how the reactor should be found.
 
@@ -31,47 +32,33 @@ def diagnose(
       setpoint: OD at which it was handed over to the on-board regulation, nan if this program controls.
       dosing: its pumps may be on. stuck: why its pumps could not be verified off, "" if they were.
       ended: why this program ended its experiment, "" if it did not.
-      overflow_trouble: why its overflow pump could not be verified on, "" if it was.
+      overflow_trouble: why its overflow pump could not be verified on, None if it was.
     """
     if state.start_time != start_time or not state.started:
-        return Fault(
-            "restarted",
-            f"the experiment of {start_time} is gone, cycles {state.cycles}, blank {state.blank:.0f}",
-            "blank and targets are restored and the experiment is started again; check the board's power",
-        )
-    if not state.running and ended:
-        return Fault("stopped", f"this program ended the experiment: {ended}", "it is started again")
+        return messages.ExperimentGone(start_time=start_time, cycles=state.cycles, blank=state.blank)
     if not state.running:
-        return Fault("stopped", "the experiment was stopped by someone", "start it in the device's web page")
+        return messages.EndedByUs(why=ended) if ended else messages.EndedBySomebody()
     if not abs(state.blank - blank) <= 0.5:  # also nan
-        changed = f"the blank was changed from {blank:.1f} to {state.blank:.1f}"
-        return Fault("blank", changed, f"set it back (raw {blank:.1f}, OD 0) or start a new run")
+        return messages.BlankChanged(before=blank, now=state.blank)
     if stuck:
-        return Fault("pump", stuck, "switch the pump board off by hand")
+        return messages.PumpStaysOn(why=stuck)
     handed_over = math.isfinite(setpoint)
     on = config.overflow_pump.others_on(state)
     if on and not dosing and not handed_over:
-        page = "close the device's web page everywhere; look for a proxy that repeats requests"
-        return Fault("pump", f"pumps on: {on}, and no dose has them", page)
+        return messages.StrayPump(pumps=on)
     if state.pumping_modes or (not regulates(state, setpoint) if handed_over else state.regulating):
-        what = ", ".join(state.pumping_modes) or describe(state)
-        return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
+        return messages.ForeignMode(mode=", ".join(state.pumping_modes) or describe(state))
+    if age_s > config.stale_s and state.spoilt:
+        return messages.NoNumber(age_s=age_s, cycles=state.cycles, items=", ".join(state.spoilt))
     if age_s > config.stale_s:
-        remedy = f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal"
-        if state.spoilt:
-            remedy = f"{', '.join(state.spoilt)} holds no number: only a restart of the device's software helps"
-        return Fault("stalled", f"no new sample for {age_s:.0f} s, cycles {state.cycles}", remedy)
-    if overflow_trouble:
-        return Fault("overflow_pump", overflow_trouble, "close the device's web page everywhere; restart the device")
-    return None
+        return messages.NoSamples(age_s=age_s, cycles=state.cycles, lost_s=config.lost_s)
+    return overflow_trouble
 
 
 def fault_of(error: ReactorError, present: bool) -> Fault:
     """Translate an error of a request or a read; `present`: the reactor was there when it was last looked at."""
     if isinstance(error, IdentityError):
-        return Fault("identity", str(error), "reactors were exchanged: start a new run")
+        return messages.ReactorsExchanged(error=error)
     if not isinstance(error, DeviceStateError):
-        return Fault("link", str(error), "asks again every few seconds")
-    if present:
-        return Fault("selection", str(error), "close the device's web page everywhere")
-    return Fault("absent", str(error), "plug it in with the server stopped")
+        return messages.NoAnswer(error=error)
+    return messages.SelectedElsewhere(error=error) if present else messages.ReactorMissing(error=error)

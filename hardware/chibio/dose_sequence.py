@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from conf.messages import Message
+from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda, Task
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import DRAIN, Connection
@@ -16,6 +18,7 @@ from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.logbook import Logbook
+from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
 __all__ = ["Context", "DoseSequence"]
@@ -25,12 +28,12 @@ WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste m
 LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then
 REFUSALS = 4  # of pumps that should be off, in a row, until the experiment is ended
 SLOW_S = 1.0  # an answer to a pump command that takes longer is told
-AGAIN = "it ran again, as a command was repeated or late on the way, or another program gave one"
 
 
-def _change(before: float, now: float) -> str:
-    """Say how a target was changed; "" if it is the same."""
-    return "" if abs(now - before) <= SAME_S / PERIOD_S else f"its target was changed from {before:.4g} to {now:.4g}"
+def _change(before: float, now: float) -> Message | None:
+    """Say how a target was changed; None if it is the same, or was not known."""
+    same = math.isnan(before) or abs(now - before) <= SAME_S / PERIOD_S
+    return None if same else messages.TargetChanged(before=before, now=now)
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class DoseSequence:
         self._due_s = math.inf  # clock time at which the dose under way should be over
         self._given_up: dict[str, float] = {}  # pumps whose command brought no answer and may yet be carried out, since
         self.stray_s = -math.inf
-        self._strays: dict[str, tuple[str, float, float, float]] = {}  # pumps that no dose has, as `_book_stray`
+        self._strays: dict[str, tuple[Message, float, float, float]] = {}  # pumps that no dose has, as `_book_stray`
         self._targets: dict[str, float] = {}  # of feed pumps, as last seen
         self._quiet_s = 0.0  # run time at which no pump was on that no dose has
         self._undrained = False
@@ -88,7 +91,7 @@ class DoseSequence:
         self._quiet_s = history.seen_s
         self.acted = history.sample
         if history.open:
-            self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open by an earlier life of the program")
+            self._book.tell(OpenDose(ml=history.feed_ml))
 
     @property
     def carry_ml(self) -> float:
@@ -101,7 +104,12 @@ class DoseSequence:
         return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
 
     def begin(
-        self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
+        self,
+        rate: float,
+        sample: tuple[float, int] | None,
+        appeared_s: float,
+        refusal: Message | None,
+        pump: str = FEED,
     ) -> DosePlan:
         """Begin the dose for `sample`; returns what was, or may have been, begun.
 
@@ -111,19 +119,19 @@ class DoseSequence:
         Args:
           rate: mean feed rate, mL/s.
           sample: its key, None if there is none; appeared_s: clock time at which it appeared, -inf if unknown.
-          refusal: why the reactor may not be dosed, "" if it may.
+          refusal: why the reactor may not be dosed, None if it may.
           pump: that gives it: the feed pump, or a supply pump, whose doses are carried nowhere.
         Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
         """
         plan = self._plan(rate, pump)
         if reason := refusal or self._obstacle(sample, appeared_s, plan.waste_s):
-            self._book.tell(f"no dose: {reason}")
+            self._book.tell(NoDose(why=reason))
             return DosePlan()
         self.acted = sample
         if plan.carry_ml > 0.0 and rate > 0.0 and pump == FEED:
-            self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
+            self._book.tell(messages.KeptForNextDose(ml=plan.carry_ml))
         if plan.shortfall_ml > 0.0:
-            self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
+            self._book.tell(messages.DoseCut(ml=plan.shortfall_ml))
         self._intend(plan, rate)
         return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
 
@@ -140,20 +148,20 @@ class DoseSequence:
         """Flow of the pump that feeds."""
         return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
 
-    def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
-        """Why no dose may be given for this sample now; "" if nothing stands against it."""
+    def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> Message | None:
+        """Why no dose may be given for this sample now; None if nothing stands against it."""
         if sample is None or sample == self.acted:
-            return "no new sample"
+            return NoNewSample()
         if self.running:
-            return "the previous dose has not ended"
-        past = self._clock.now() - appeared_s
-        if math.isinf(past):
-            return "its sample is of unknown age, the next one is waited for"
-        if past + waste_s > self._config.window_s:
-            return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
-        if past + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # what `_set_targets` will take
-            return f"the device answers too slowly ({past:.0f} s after the sample)"
-        return ""
+            return DoseUnderWay()
+        past_s = self._clock.now() - appeared_s
+        if math.isinf(past_s):
+            return messages.UnknownAge()
+        if past_s + waste_s > self._config.window_s:
+            return messages.SampleTooOld(past_s=past_s)
+        if past_s + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # what `_set_targets` will take
+            return messages.TooSlow(past_s=past_s)
+        return None
 
     def _intend(self, plan: DosePlan, rate: float) -> None:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
@@ -178,14 +186,10 @@ class DoseSequence:
             self._book.log("feed_on", on_s=self._book.elapsed())  # before it is done: a resumed run must know of it
             self._connection.switch(plan.pump, True)
             if self._clock.now() - asked_s > SLOW_S:
-                took_s = self._clock.now() - asked_s
-                self._book.tell(f"the link is slow: the feed pump's command was answered after {took_s:.1f} s")
+                self._book.tell(messages.SlowLink(took_s=self._clock.now() - asked_s))
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             self._in_doubt()
-            self._book.tell(
-                f"the command to {plan.pump} was lost or refused, what it did is looked for: {error}" if fed
-                else f"no dose: {error}"
-            )  # fmt: skip
+            self._book.tell(messages.CommandLost(pump=plan.pump, error=error) if fed else NoDose(why=error))
         finally:
             now, fed_s = self._clock.now(), plan.feed_s + DOSE_OFF_S if fed else 0.0
             if fed:
@@ -205,10 +209,10 @@ class DoseSequence:
         as_set = np.allclose(targets, (plan.feed_duty, plan.waste_duty), rtol=0.0, atol=1e-5)
         on = self._config.overflow_pump.others_on(state)
         if not as_set or on or not state.running or state.regulating:
-            raise DeviceStateError(f"targets {tuple(targets)}, pumps on: {on or 'none'}: not as set")
-        past = self._clock.now() - appeared_s
-        if past + plan.waste_s > self._config.window_s:
-            raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
+            raise messages.NotAsSet(targets=tuple(targets), pumps=on or "none")
+        past_s = self._clock.now() - appeared_s
+        if past_s + plan.waste_s > self._config.window_s:
+            raise messages.TooSlow(past_s=past_s)
 
     def _feed_off(self, pump: str) -> Task:
         """Task: feed pump off, again and again until the device has heard it."""
@@ -298,11 +302,11 @@ class DoseSequence:
             self._targets.clear()
         for pump in (FEED, *self._config.supply.pumps):
             target, before = state.pump_targets[PUMPS.index(pump)], self._targets.get(pump, math.nan)
-            self._targets[pump], change = target, "" if math.isnan(before) else _change(before, target)
+            self._targets[pump], change = target, _change(before, target)
             if not ours or (known.open and pump == known.feed_pump):
                 continue
             if pump in state.running_pumps:
-                self._strays.setdefault(pump, (change or AGAIN, target, self._quiet_s, now))
+                self._strays.setdefault(pump, (change or messages.RanAgain(), target, self._quiet_s, now))
             elif pump not in self._strays and change:
                 self._book_stray(pump, change, target, self._quiet_s, math.nan)
         if self._strays:
@@ -322,18 +326,18 @@ class DoseSequence:
             ago_s = {} if math.isnan(seen_s) else self._connection.switched_off()
             stopped = {pump: now - s for pump, s in ago_s.items() if now - s > known.on_s}
         except ReactorError as error:
-            self._book.tell(f"the board agent does not say what it switched off: {error}")
+            self._book.tell(messages.AgentSaysNothing(error=error))
         if stopped:
-            self._book.tell(f"the board agent switched off in a dose: {', '.join(stopped)}")
+            self._book.tell(messages.AgentSwitchedOff(pumps=", ".join(stopped)))
         if known.experiment not in ("", state.start_time):
-            self._book.tell("the device was restarted in a dose, which ended it")
+            self._book.tell(messages.RestartedInDose())
         seen_s, silence_s = now if math.isnan(seen_s) else seen_s, self._config.deadman_s
         if added := found(known, state, now, seen_s, silence_s, stopped, killed=not self.running):
             self._book.log("found", **added)
         for part, pump, set_s in (("feed", known.feed_pump, known.feed_s), ("waste", WASTE, known.waste_s)):
             if f"{part}_anew" in added:
                 change = _change(set_s / PERIOD_S, state.pump_targets[PUMPS.index(pump)])
-                self._book.tell(f"{pump} in a dose: {change or AGAIN}")
+                self._book.tell(messages.ChangedInDose(pump=pump, cause=change or messages.RanAgain()))
 
     def _conclude(self, known: ReactorHistory) -> None:
         """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
@@ -346,12 +350,11 @@ class DoseSequence:
         self.extra += ending.beyond(booked_ml)
         may_be_late = self._book.elapsed() < self._given_up.get(known.feed_pump, -math.inf) + LATE_S
         if known.fed and may_be_late and not note:
-            twice = f"{ending.feed_ml:.2f} to {2.0 * ending.feed_ml:.2f} mL, booked as the former"
-            self._book.tell(f"a dose gave {twice}: a feed command that was given up may have been heard in it")
+            self._book.tell(messages.DosePerhapsTwice(ml=ending.feed_ml, twice_ml=2.0 * ending.feed_ml))
         if known.fed and math.isnan(known.feed_on[1]):
             self._given_up[known.feed_pump] = known.on_s
 
-    def _book_stray(self, pump: str, cause: str, target: float, off_s: float, seen_s: float) -> None:
+    def _book_stray(self, pump: str, cause: Message, target: float, off_s: float, seen_s: float) -> None:
         """Book what a pump gave that no dose had. Args: it was off at off_s, and seen on at seen_s, nan if never."""
         self.stray_s = self._clock.now()
         known = self._past()
@@ -369,8 +372,8 @@ class DoseSequence:
         given = [replace(one, waste_ml=one.waste_ml * (not alone)) for one in ending.beyond(0.0)]
         for one in given:
             self._book.log("given", **one.row("without a dose"))
-        total_ml, low_ml = sum(one.feed_ml for one in given), sum(one.low_ml for one in given)
-        self._book.tell(f"{pump} gave {low_ml:.2f} to {total_ml:.2f} mL without a dose, booked as the latter: {cause}")
+        most_ml, low_ml = sum(one.feed_ml for one in given), sum(one.low_ml for one in given)
+        self._book.tell(messages.GivenWithoutDose(pump=pump, low_ml=low_ml, most_ml=most_ml, cause=cause))
         self.extra += given
         self._undrained = self._undrained or (alone and bool(given))
 

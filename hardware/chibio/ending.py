@@ -9,7 +9,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from conf.messages import Message
 from hardware.chibio.dosing import PumpCalibration
+from hardware.chibio.messages import DoseGave, DoseGaveNothing, DoseRepeated
 from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory, Span
 from hardware.storage.doses import Ending
@@ -128,8 +130,8 @@ def found(
 
 def conclude(
     known: ReactorHistory, now_s: float, feed: PumpCalibration, waste: PumpCalibration
-) -> tuple[Ending, str]:  # fmt: skip
-    """How the open dose in `known` ended, and in words what is not as planned, "" if nothing is.
+) -> tuple[Ending, Message | None]:
+    """How the open dose in `known` ended, and what is not as planned, None if nothing is.
 
     Args: now_s: run time at which its pumps were verified off. feed, waste: the two pumps.
     """
@@ -157,13 +159,12 @@ def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) ->
     return pump.volume(min(dose_s, on_s)), times, last_ml
 
 
-def _words(ending: Ending, known: ReactorHistory) -> str:
+def _words(ending: Ending, known: ReactorHistory) -> Message | None:
     """Say what is not as planned."""
-    low_ml, most_ml, times = ending.feed_low_ml, ending.feed_ml + ending.repeated_ml, ending.feed_times
-    dose, volume = f"a dose of {known.feed_ml:.2f} mL", f"{low_ml:.2f} to {most_ml:.2f} mL"
-    if times and math.isnan(known.feed_anew[0]):
-        return f"{dose} was repeated up to {times} times by the device, {volume} in all, booked at their times"
+    ml, low_ml, most_ml = known.feed_ml, ending.feed_low_ml, ending.feed_ml + ending.repeated_ml
+    if (times := ending.feed_times) and math.isnan(known.feed_anew[0]):
+        return DoseRepeated(ml=ml, times=times, low_ml=low_ml, most_ml=most_ml)
     if most_ml < 1e-3:
-        return f"{dose} gave no medium"
-    as_planned = not times and low_ml >= 0.95 * known.feed_ml - 0.1
-    return "" if as_planned else f"{dose} gave {volume}, booked as the latter"
+        return DoseGaveNothing(ml=ml)
+    as_planned = not times and low_ml >= 0.95 * ml - 0.1
+    return None if as_planned else DoseGave(ml=ml, low_ml=low_ml, most_ml=most_ml)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from conf.schema import check, require, setting
 from hardware.chibio.connection import Connection
+from hardware.chibio.messages import PutRight, SlotAmiss
 from hardware.chibio.protocol import BANDS, LEDS, SLOTS, DeviceState, Slot
 from hardware.logbook import Logbook
 
@@ -67,11 +68,11 @@ class FluorescenceSlotConfig:
 class Fluorescence:
     """The fluorescence slot of one reactor: looked at with every read, put right, read back.
 
-    Attributes: trouble, why it could not be verified on, "" if it was.
+    Attributes: trouble, why it could not be verified on, None if it was.
     """
 
     def __init__(self, connection: Connection, config: FluorescenceSlotConfig, book: Logbook) -> None:
-        self.trouble = ""
+        self.trouble: SlotAmiss | None = None
         self._connection, self._config, self._book = connection, config, book
         self._was_on = False
         self._switched_in = -1  # the cycle in which it was last toggled, which may have been after its measurement
@@ -88,9 +89,9 @@ class Fluorescence:
             if found != "off" and still == "off":  # it takes its settings when it goes on
                 state, still = self._toggle()
         slot = self._config.slot
-        self.trouble = f"the fluorescence slot {slot} is {still} after it was switched on" if still else ""
+        self.trouble = SlotAmiss(slot=slot, found=still) if still else None
         if found and not still and self._was_on:
-            self._book.tell(f"the fluorescence slot {slot} was found {found} and put right")
+            self._book.tell(PutRight(item=f"the fluorescence slot {slot}", found=found, done="switched on again"))
         self._was_on = self._was_on or not still
         return state
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from conf.schema import check, setting
 from hardware.chibio.connection import Connection
+from hardware.chibio.messages import OverflowPumpAmiss, PutRight
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
 from hardware.logbook import Logbook
 
@@ -63,11 +64,12 @@ class OverflowPumpConfig:
 class OverflowPump:
     """The overflow pump of one reactor: looked at with every read, put right, read back.
 
-    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on.
+    Attributes: trouble, why it could not be verified on, None if it was; was_on, whether it was known to be on.
     """
 
     def __init__(self, connection: Connection, config: OverflowPumpConfig, book: Logbook) -> None:
-        self.trouble, self.was_on = "", False
+        self.trouble: OverflowPumpAmiss | None = None
+        self.was_on = False
         self._connection, self._config, self._book = connection, config, book
 
     def keep_on(self, state: DeviceState) -> DeviceState:
@@ -77,7 +79,7 @@ class OverflowPump:
         """
         config, connection = self._config, self._connection
         if not (found := config.wrong(state)):
-            self.trouble, self.was_on = "", self.was_on or bool(config.pump)
+            self.trouble, self.was_on = None, self.was_on or bool(config.pump)
             return state
         if found != "off" or state.pump_targets[PUMPS.index(config.pump)] != config.duty:
             connection.target(config.pump, config.duty)
@@ -85,10 +87,11 @@ class OverflowPump:
             connection.switch(config.pump, True)
         state = connection.read()
         if still := config.wrong(state):
-            self.trouble = f"the overflow pump, {config.pump}, is {still} after it was set to {config.duty:g} and on"
+            self.trouble = OverflowPumpAmiss(pump=config.pump, found=still, duty=config.duty)
             return state
-        known, self.trouble, self.was_on = self.was_on, "", True
+        known, self.trouble, self.was_on = self.was_on, None, True
         self._book.log("overflow_pump", pump=config.pump, duty=config.duty, found=found)
         if known:
-            self._book.tell(f"the overflow pump was found {found} and put right: {config.pump} at {config.duty:g}")
+            done = f"set to {config.duty:g} and on"
+            self._book.tell(PutRight(item=f"the overflow pump, {config.pump},", found=found, done=done))
         return state

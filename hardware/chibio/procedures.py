@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from hardware.chibio.connection import Connection
+from hardware.chibio.messages import ExperimentRuns, FaultsStand, NoBlank, NotWarm
 from hardware.chibio.protocol import PERIOD_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
-from hardware.errors import DeviceStateError, SensorError
 from hardware.reactor import Array, Measurement
 
 __all__ = ["dose_series", "measure_blanks", "warm_up"]
@@ -25,7 +25,7 @@ def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, do
     """
     state = connection.read()
     if state.running:
-        raise DeviceStateError(f"{connection.name}: an experiment is running; stop it before pumps are weighed")
+        raise ExperimentRuns(reactor=connection.name)
     try:
         connection.pumps_off()
         connection.target(pump, duty)
@@ -58,10 +58,8 @@ def warm_up(
         minutes = (reactors.elapsed() - start) / 60.0
         worst = int(np.argmax(np.where(reached >= 2, -1.0, np.nan_to_num(off, nan=np.inf))))
         if minutes > limit_min:
-            raise SensorError(
-                f"{reactors.names[worst]}: {m.temperature[worst]:.1f} degC after {minutes:.0f} min, wanted {target:g} "
-                f"+- {tolerance:g}; check heater and lid, warm the medium first, or raise warm_up or tolerance"
-            )
+            name, warm = reactors.names[worst], m.temperature[worst]
+            raise NotWarm(reactor=name, temperature=warm, minutes=minutes, target=target, tolerance=tolerance)
         if minutes >= due and np.isfinite(m.temperature).all():
             due = minutes + every_min
             yield minutes, float(m.temperature[worst])
@@ -73,7 +71,7 @@ def _sound(reactors: ChiBioReactors) -> Measurement:
     assert m.vitals is not None
     faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]
     if faults:
-        raise DeviceStateError("; ".join(faults))
+        raise FaultsStand(faults="; ".join(faults))
     return m
 
 
@@ -96,10 +94,7 @@ def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array
     mean, sd = counts.mean(axis=1), counts.std(axis=1, ddof=1)
     for name, value, spread in zip(reactors.names, mean, sd, strict=True):
         if not 3000.0 <= value <= 60000.0 or spread > 0.02 * value:
-            raise SensorError(
-                f"{name}: blank {value:.0f} +- {spread:.0f} counts, allowed 3000 to 60000 with a scatter under 2 %; "
-                "check that the vial is seated, the medium clear and without bubbles"
-            )
+            raise NoBlank(reactor=name, counts=value, sd=spread)
     for station, value in zip(reactors.stations, mean, strict=True):
         station.set_blank(float(value))
     return mean, sd

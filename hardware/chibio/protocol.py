@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hardware.errors import DeviceStateError, ProtocolError
+from hardware.chibio.messages import Forbidden, NotUnderstood
 
 __all__ = [
     "BANDS", "CONTROL_S", "FEED", "LEAST_ML", "LEDS", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS",
@@ -142,7 +142,7 @@ class DeviceState:
 def _get(data: Any, *keys: str) -> Any:
     for key in keys:
         if not isinstance(data, dict) or key not in data:
-            raise ProtocolError(f"device state: field {'.'.join(keys)} is missing")
+            raise NotUnderstood(what=f"field {'.'.join(keys)} is missing")
         data = data[key]
     return data
 
@@ -154,14 +154,14 @@ def _number(data: Any, *keys: str) -> float:
             return float(value)
         except OverflowError:
             pass
-    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected a number")
+    raise NotUnderstood(what=f"{'.'.join(keys)} = {str(value)[:40]!r}, expected a number")
 
 
 def _flag(data: Any, *keys: str) -> bool:
     value = _get(data, *keys)
     if value in (0, 1):  # also True, False, 0.0 and 1.0
         return bool(value)
-    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected 0 or 1")
+    raise NotUnderstood(what=f"{'.'.join(keys)} = {str(value)[:40]!r}, expected 0 or 1")
 
 
 def _line(text: str) -> str:
@@ -173,7 +173,7 @@ def _text(data: Any, *keys: str) -> str:
     value = _get(data, *keys)
     if isinstance(value, str):
         return _line(value)
-    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected text")
+    raise NotUnderstood(what=f"{'.'.join(keys)} = {str(value)[:40]!r}, expected text")
 
 
 def _newest(data: Any) -> tuple[float, ...]:
@@ -183,7 +183,7 @@ def _newest(data: Any) -> tuple[float, ...]:
     """
     lists = {name: _get(data, name, "record") for name in ("time", "OD", "ThermometerIR")}
     if not all(isinstance(x, list) for x in lists.values()):
-        raise ProtocolError("device state: a record is not a list")
+        raise NotUnderstood(what="a record is not a list")
     cut = data.get("_records")
     lengths = {_number(cut, name) if isinstance(cut, dict) else len(x) for name, x in lists.items()}
     whole = len(lengths) == 1 and 0 < min(lengths) < math.inf
@@ -216,14 +216,14 @@ def parse_state(body: bytes) -> DeviceState:
     try:
         data = json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"device state: not JSON ({str(error)[:80]}): {body[:60]!r}") from error
+        raise NotUnderstood(what=f"not JSON ({str(error)[:80]}): {body[:60]!r}") from error
     if not isinstance(data, dict):
-        raise ProtocolError(f"device state: expected an object, got {body[:60]!r}")
+        raise NotUnderstood(what=f"expected an object, got {body[:60]!r}")
     present = _get(data, "presentDevices")
     sample_s, sample_od, sample_temperature = _newest(data)
     cycles = _number(data, "Experiment", "cycles")
     if not (math.isfinite(cycles) and -1 <= cycles < 1e9):
-        raise ProtocolError(f"device state: Experiment.cycles = {cycles}, expected a count")
+        raise NotUnderstood(what=f"Experiment.cycles = {cycles}, expected a count")
     return DeviceState(
         selected=_text(data, "UIDevice"),
         present=tuple(m for m in POSITIONS if isinstance(present, dict) and m in present and _flag(present, m)),
@@ -295,7 +295,4 @@ def check_command(path: str, permitted: Permitted) -> None:
         case ["", "CalibrateOD", "OD0", name, raw, "0"] if re.fullmatch(_NUMBER, raw):
             allowed = 3000.0 <= float(raw) <= 60000.0
     if not (allowed and name in permitted.reactors and name in POSITIONS):
-        raise DeviceStateError(
-            f"refused to send POST {path[:80]}: not among the commands and limits a client may use; "
-            f"reactors of this run: {', '.join(permitted.reactors)}"
-        )
+        raise Forbidden(path=path[:80], reactors=", ".join(permitted.reactors))

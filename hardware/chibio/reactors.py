@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from envs.bench import Bench
+from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
@@ -99,7 +100,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
                 failed.append(error)
                 if not histories or len(failed) == len(self.stations):
                     raise
-                station.book.say(f"not taken over, the others go on and this one is tried again: {error}")
+                station.book.say(messages.NotTakenOver(error=error))
         self._bring_up([station for station in self.stations if station.restored], resumed=bool(histories))
 
     def _bring_up(self, stations: Sequence[ChibioStation], resumed: bool) -> None:
@@ -110,7 +111,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
             station.busy = True
             wait_s = 0.0 if running else slot * 60.0 / len(self.stations)
             if wait_s:
-                station.book.say(f"its experiment starts in {wait_s:.0f} s, one reactor after the other")
+                station.book.say(messages.StartsInTurn(seconds=wait_s))
             self._agenda.add(station.take_over() if resumed else station.bring_up(), wait_s)
             slot += not running
         self._agenda.run_due()
@@ -119,7 +120,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
             self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
         for station in stations:
             if not resumed and (trouble := station.overflow_pump.trouble or station.fluorescence.trouble):
-                raise DeviceStateError(f"{station.name}: {trouble}; run the preflight")
+                raise messages.NotReady(reactor=station.name, trouble=trouble)
 
     def _between(self) -> None:
         """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
@@ -158,16 +159,13 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
             station.connection.escalate()
         return failed(list(pending))
 
-    def _not_off(self, failed: str) -> str:
-        return f"pumps not verified off: {failed}. Switch the pump boards off by hand now"
-
     def end(self) -> None:
         """`stop`, then end every experiment. Raises: ReactorError if one goes on."""
         self.stop()
         for station in self.stations:
             station.connection.post(f"/Experiment/0/{station.name}")
             if station.connection.read().running:
-                raise DeviceStateError(f"{station.name}: the experiment does not end; stop it in the web page")
+                raise messages.DoesNotEnd(reactor=station.name)
 
     def write(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Remember and log, or neither. Raises: what the log raises."""

@@ -3,7 +3,9 @@
 import math
 from collections import deque
 
+from conf.messages import Message
 from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.messages import SampleBeforeLate, SampleLate
 from hardware.chibio.protocol import DeviceState
 from hardware.clock import Clock
 
@@ -63,8 +65,8 @@ class Sampling:
         """Note a look without a sample to act on: there was none, or a new one that a fault forbids to use."""
         self._looked = not is_new
 
-    def take(self, state: DeviceState, now: float) -> str:
-        """Make a new sample the newest one; returns what it shows of the board's clock, "" if nothing.
+    def take(self, state: DeviceState, now: float) -> Message | None:
+        """Make a new sample the newest one; returns what it shows of the board's clock, None if nothing.
 
         Args: now: clock time at which it was seen.
         """
@@ -77,18 +79,16 @@ class Sampling:
         self._looked = False
         return note
 
-    def _measure_lateness(self, offset: float) -> str:
+    def _measure_lateness(self, offset: float) -> Message | None:
         """How much later than possible this sample was seen: its offset against the smallest of recent ones.
 
         A step of the board's clock looks like lateness. Only samples that were waited for enter the measure, so three
         of them replace the offsets of before.
         """
-        note = ""
+        note: Message | None = None
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
             late_s = offset - min(self._offsets)
-            note = f"the sample before came {-late_s:.0f} s late, or the board's clock was set forward by that"
-            if late_s > 0.0:
-                note = f"a sample came {late_s:.0f} s late, or the board's clock was set back by that"
+            note = SampleLate(late_s=late_s) if late_s > 0.0 else SampleBeforeLate(late_s=-late_s)
             self._offsets.clear()
         if self._looked or (self._offsets and offset < min(self._offsets)):
             self._offsets.append(offset)

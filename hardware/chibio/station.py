@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from conf.messages import Message
+from hardware.chibio import messages
 from hardware.chibio.agenda import Task
 from hardware.chibio.diagnosis import describe, diagnose, fault_of, regulates
 from hardware.chibio.dose_sequence import Context, DoseSequence
@@ -16,7 +18,6 @@ from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, PUMPS, DeviceState
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.reactor import Fault
 from hardware.stations import Newest
 
 __all__ = ["ChibioStation"]
@@ -96,7 +97,7 @@ class ChibioStation:
                 self._take_control()
             self.doses.settle(tries=3)
             if on := self._config.overflow_pump.others_on(state):
-                self.book.tell(f"pumps were found on and switched off: {on}")
+                self.book.tell(messages.PumpsFoundOn(pumps=on))
         self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
@@ -108,11 +109,11 @@ class ChibioStation:
             yield from self._let_measure()
             state = self.connection.read()
             if state.running and state.measuring:  # still: nobody measures there any more
-                self.book.say(f"the device has measured for {MEASURING_S:.0f} s, which is too long: started anew")
+                self.book.say(messages.MeasuresTooLong(seconds=MEASURING_S))
                 self.connection.post(f"/Experiment/0/{self.name}")
                 state = self.connection.read()
             if not state.running and state.cycles > 0 and not waited and not state.ended:
-                self.book.say(f"an experiment was stopped, its last cycle may still end: waits {OLD_CYCLE_S:.0f} s")
+                self.book.say(messages.OldCycle(seconds=OLD_CYCLE_S))
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.fluorescence.keep_on(self.connection.read())
@@ -139,13 +140,11 @@ class ChibioStation:
         """Task: `bring_up` in a run that goes on meanwhile; what does not succeed is said and tried again."""
         try:
             if not self.connection.read().running:
-                self.book.say("its experiment was stopped meanwhile and is started again")
+                self.book.say(messages.StoppedMeanwhile())
             yield from self.bring_up()
         except ReactorError as error:
             self.restored = False
-            self.book.report(
-                Fault("stopped", f"not taken over: {error}", "the others go on and this one is tried again")
-            )
+            self.book.report(messages.NotTakenOver(error=error))
 
     def _let_measure(self) -> Task:
         """Task: a measurement under way is over, or has taken too long; a blank changed in one would spoil it.
@@ -163,8 +162,7 @@ class ChibioStation:
         """Blank and targets as they belong to this run; on-board regulation off, unless it was handed over to that."""
         connection, state = self.connection, self.connection.read()
         if state.pumping_modes:
-            modes = ", ".join(state.pumping_modes)
-            raise DeviceStateError(f"{self.name}: {modes} is on; switch it off in the device's web page")
+            raise messages.ModeOn(reactor=self.name, modes=", ".join(state.pumping_modes))
         if state.regulating and not self.handed_over:
             self._take_control()
         if not abs(state.blank - self._blank) <= 0.5:  # also nan
@@ -179,10 +177,10 @@ class ChibioStation:
         state = connection.read()
         taken = abs(state.blank - self._blank) <= 0.5 and abs(state.temperature_target - self._target_c) <= 1e-3
         if not taken:
-            raise DeviceStateError(
-                f"{self.name} did not take its settings: blank {state.blank:.1f} (asked {self._blank:.1f}), thermostat "
-                f"{state.temperature_target} degC (asked {self._target_c}); run the preflight"
-            )
+            raise messages.SettingsNotTaken(
+                reactor=self.name, blank=state.blank, asked=self._blank, target=state.temperature_target,
+                asked_c=self._target_c,
+            )  # fmt: skip
 
     def _start(self) -> Task:
         """Task: start the experiment; the state is read before every try, because a second start stops it."""
@@ -195,7 +193,7 @@ class ChibioStation:
             except LinkError:
                 yield self._config.retry_s
         if not self.connection.read().running:
-            raise DeviceStateError(f"{self.name}: the experiment does not start; look at the device's terminal")
+            raise messages.DoesNotStart(reactor=self.name)
 
     def _recover(self, kind: str) -> Task:
         """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead.
@@ -204,7 +202,7 @@ class ChibioStation:
         """
         self._restarts += 1
         if self._restarts > 1:
-            self.book.tell(f"the restart before brought no sample, attempt {self._restarts} follows")
+            self.book.tell(messages.RestartedAgain(attempt=self._restarts))
         try:
             self.doses.settle(tries=3)
             if kind == "stalled":
@@ -215,10 +213,10 @@ class ChibioStation:
                 self.sampling.key = None  # the device's records begin anew: any sample is a new one
                 self.doses.acted = None
             yield from self.bring_up(waited=kind != "stopped")
-            self.book.tell(f"restarted after: {kind}")
+            self.book.tell(messages.RestartedAfter(kind=kind))
         except ReactorError as error:
             self._again_s = self._clock.now() + AGAIN_S
-            self.book.tell(f"the experiment could not be restarted after {kind}, tried again: {error}")
+            self.book.tell(messages.NotRestarted(kind=kind, error=error))
         finally:
             self.busy = False
             self.sampling.arrived_s = self._clock.now()  # a further recovery waits its time
@@ -310,28 +308,27 @@ class ChibioStation:
         targets = (("Thermostat", state.temperature_target, self._target_c), ("Stir", state.stir_target, stir))
         for item, value, wanted in targets:
             if not abs(value - wanted) <= 1e-3:
-                self._mend(f"{item} was set to {value:g}", f"set back to {wanted:g}", connection.target, item, wanted)
+                self._mend(f"set to {value:g}", f"set back to {wanted:g}", connection.target, item, wanted)
         for item, on, needed in (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, stir > 0.0)):
             if needed and not on:
-                self._mend(f"{item} was off", "switched on again", connection.switch, item, True)
+                self._mend("off", "switched on again", connection.switch, item, True)
 
     def _unspoil(self, state: DeviceState) -> None:
         """Set a pump's target to a number again, before the device works with it; tell where it has."""
         for item in state.spoilt:
             if item in PUMPS and math.isnan(state.pump_targets[PUMPS.index(item)]):
-                self._mend(f"{item} was set to no number by somebody", "set to 0", self.connection.target, item, 0.0)
+                self._mend("set to no number by somebody", "set to 0", self.connection.target, item, 0.0)
             elif not self._spoilt:
-                what = f"{', '.join(state.spoilt)} hold no number, and measuring will end at the device's next dump"
-                self.book.tell(f"{what}: restart the device's software, the run goes on then")
+                self.book.tell(messages.DumpWillFail(items=", ".join(state.spoilt)))
                 self._spoilt = True
         self._spoilt = self._spoilt and bool(state.spoilt)
 
     def _mend(self, found: str, done: str, request: Callable[[str, Any], None], item: str, value: float) -> None:
         try:
             request(item, value)
-            self.book.tell(f"{found} and was {done}")
+            self.book.tell(messages.PutRight(item=item, found=found, done=done))
         except ReactorError as error:
-            self.book.tell(f"{found} and could not be {done}: {error}")
+            self.book.tell(messages.NotPutRight(item=item, found=found, done=done, error=error))
 
     # --------------------------------------------------------------------------------------------------- actuation
 
@@ -340,13 +337,14 @@ class ChibioStation:
 
         Args: rate: mL/s. number: of the pump that feeds.
         """
-        refusal, pump = "", f"Pump{number}"
+        refusal: Message | None = self.book.fault
+        pump = f"Pump{number}"
         if self.handed_over:
-            refusal = "handed over to the on-board regulation"
-        elif self.busy or self.book.fault is not None:
-            refusal = str(self.book.fault or "being started")
-        elif pump not in (FEED, *self._config.supply.pumps):
-            refusal = f"{pump} has no tube; weigh it and give backend.supply.{pump.lower()}_ml_s"
+            refusal = messages.OnBoardRegulation()
+        elif self.busy:
+            refusal = refusal or messages.BeingStarted()
+        elif refusal is None and pump not in (FEED, *self._config.supply.pumps):
+            refusal = messages.NoTube(pump=pump, setting=f"{pump.lower()}_ml_s")
         return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal, pump)
 
     def pumps_off(self) -> None:
@@ -360,7 +358,7 @@ class ChibioStation:
             self.connection.switch("OD", False)
             self.book.log("regulate", setpoint=None)
             self.regulated_od = math.nan
-            self.book.tell("on-board regulation switched off: the reactor is given up")
+            self.book.tell(messages.RegulationEnded())
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
@@ -375,24 +373,22 @@ class ChibioStation:
         connection.switch("OD", True)
         state = connection.read()
         if not regulates(state, setpoint):
-            raise DeviceStateError(f"{self.name}: {describe(state)} after it was switched on at {setpoint:g}")
+            raise messages.HandOverFailed(reactor=self.name, found=describe(state), setpoint=setpoint)
         self.regulated_od = setpoint
 
     def _hand_over_again(self) -> None:
         """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
-        state, what = self.connection.read(), "left to it"
+        state, done = self.connection.read(), "left to it"
         if not regulates(state, self.regulated_od):
             self.regulate(self.regulated_od)
-            what = f"handed over again, because its {describe(state)}"
-        self.book.tell(
-            f"handed over to the on-board regulation at OD {self.regulated_od:g} earlier in this run: {what}"
-        )
+            done = f"handed over again, because its {describe(state)}"
+        self.book.tell(messages.StaysHandedOver(setpoint=self.regulated_od, done=done))
 
     def _take_control(self) -> None:
         """Switch the on-board regulation off, which was found on. Raises: ReactorError."""
         self.connection.switch("OD", False)
         if not self.handed_over:
-            self.book.tell("the on-board OD regulation was found on and switched off: this run controls")
+            self.book.tell(messages.RegulationFoundOn())
 
     def set_temperature(self, target_c: float) -> None:
         """Thermostat target, degC; nan leaves it. A failure becomes a note, and the next call tries again."""
@@ -401,7 +397,7 @@ class ChibioStation:
         try:
             self.connection.target("Thermostat", target_c)
         except ReactorError as error:
-            self.book.tell(f"thermostat target {target_c} degC not set, tried again with the next sample: {error}")
+            self.book.tell(messages.TemperatureNotSet(target=target_c, error=error))
             return
         self._target_c = target_c
         self.book.log("temperature", temperature=target_c)

@@ -14,7 +14,8 @@ import httpx
 
 from conf.schema import require
 from hardware.clock import DeviceClock
-from hardware.errors import LinkError, ProtocolError, ReactorError
+from hardware.errors import ReactorError
+from hardware.link import messages
 from hardware.link.transport import (
     MAX_BODY,
     WEB_ADDRESS,
@@ -103,22 +104,21 @@ def fetch(
             for chunk in answer.iter_raw():
                 found += chunk
                 if len(found) > MAX_BODY:
-                    raise ProtocolError(f"{what}: the answer is longer than {MAX_BODY} bytes")
+                    raise messages.TooLong(request=what, most=MAX_BODY)
                 if time.monotonic() > deadline:
-                    raise LinkError(f"{what}: the answer was not complete after {wait_s:.1f} s")
+                    raise messages.NotComplete(request=what, seconds=wait_s)
             return answer.status_code, bytes(found), answer.headers
     except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
         if time.monotonic() > deadline:
-            raise LinkError(f"{what}: the answer was not complete after {wait_s:.1f} s") from error
+            raise messages.NotComplete(request=what, seconds=wait_s) from error
         if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
-            raise LinkError(f"{what}: {url} closed the connection without a whole answer") from error
-        raise ProtocolError(f"{what}: not an HTTP answer ({error})") from error
+            raise messages.CutOff(request=what, url=url) from error
+        raise messages.NotHttp(request=what, why=error) from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
         reason, host = str(error) or type(error).__name__, url.removesuffix(urlsplit(url).path)
         reached = isinstance(error, (httpx.ReadTimeout, httpx.ReadError))
-        hung = "its software hangs or ended: look at the board's disk, close its web page"
-        remedy = hung if reached else "check cable and server"
-        raise LinkError(f"{what}: no answer from {host} ({reason}); {remedy}") from error
+        failed = messages.NotAnswered if reached else messages.NotReached
+        raise failed(request=what, host=host, why=reason) from error
 
 
 class HttpTransport(Transport):
@@ -169,5 +169,5 @@ class HttpTransport(Transport):
         status, body, headers = fetch(self._client, method, self.url + path, self._read_s)
         if status in REFUSED and headers.get("server", "").startswith(AGENT):
             why = body[:300].decode("ascii", "replace").strip()
-            raise LinkError(f"{method} {path}: the board agent refuses it: {why}")
+            raise messages.AgentRefuses(request=f"{method} {path}", why=why)
         return Reply(status, body, headers.get("date", ""))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hardware.clock import Clock
-from hardware.errors import LinkError
+from hardware.link.messages import BrokerNotReached, NoMqtt
 
 __all__ = ["MqttLink"]
 
@@ -34,7 +34,7 @@ class MqttLink:
         try:
             paho = importlib.import_module("paho.mqtt.client")
         except ImportError:
-            raise LinkError("MQTT needs its library: pip install 'paho-mqtt>=2'") from None
+            raise NoMqtt() from None
         self._clock, self._topics, self._again, self._will, self._kept = clock, tuple(topics), again, will, ""
         self.broke_s, self.lost, self.refusal, self._is_up = -math.inf, "", "", False
         self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
@@ -53,8 +53,7 @@ class MqttLink:
                 self._client.tls_set_context(ssl.create_default_context(cafile=ca_file or None))
             self._client.connect(host, port, keepalive=10)
         except (OSError, ValueError) as error:  # also of TLS, and of a file that is not there
-            remedy = "check backend.broker, backend.tls and backend.ca_file, and that it is on"
-            raise LinkError(f"MQTT broker {host}:{port}: {error}; {remedy}") from None
+            raise BrokerNotReached(broker=f"{host}:{port}", error=error) from None
         self._client.loop_start()
 
     @property

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from hardware.errors import DeviceStateError
 from hardware.link.http import HttpTransport
+from hardware.link.messages import DeviceTaken
 from hardware.link.serial import SerialTransport
 from hardware.link.transport import Transport, TransportConfig, new_session
 
@@ -37,9 +37,7 @@ class DeviceLock:
             with closing(self._held), suppress(OSError):
                 self._held.connect(f"\0{name}")
                 holder = str(struct.unpack("3i", self._held.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0])
-            raise DeviceStateError(
-                f"{device} is already controlled by process {holder}: one client per device"
-            ) from error
+            raise DeviceTaken(device=device, holder=holder) from error
         kept = Path(tempfile.gettempdir()) / f"{name}.{os.getuid()}"
         try:
             self.session = int(kept.read_text()) % 2**16 or new_session()

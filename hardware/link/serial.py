@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError
+from hardware.link import messages
 from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session, switched_off
 
 if TYPE_CHECKING:
@@ -108,8 +109,7 @@ class SerialTransport(Transport):
                 self.port, baudrate=self._config.baud, timeout=connect_s, write_timeout=connect_s, exclusive=True
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            remedy = "check cable and port name, close other programs"
-            raise LinkError(f"serial port {self.port}: {error}; {remedy}") from error
+            raise messages.PortNotOpened(port=self.port, error=error) from error
         self._count = random.SystemRandom().randrange(2**15)  # a late reply to an earlier life has another ID
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
@@ -123,9 +123,9 @@ class SerialTransport(Transport):
             hello = json.loads(reply.body)
             protocol = hello["protocol"]
         except (ValueError, RecursionError, KeyError, TypeError) as error:
-            raise ProtocolError(f"the board agent's greeting is not readable: {reply.body[:80]!r}") from error
+            raise messages.AgentNotReadable(what="greeting", said=reply.body[:80]) from error
         if protocol != 2:
-            raise ProtocolError(f"the board agent speaks protocol {protocol}, this driver 2: install the same version")
+            raise messages.AgentOutdated(protocol=protocol)
         return dict(hello)
 
     def close(self) -> None:
@@ -139,10 +139,10 @@ class SerialTransport(Transport):
         reply = self._exchange(method, path)
         if reply.status >= 100:
             return reply
-        text = _text(reply)
+        request, text = f"{method} {path}", _text(reply)
         if reply.status in (10, 11):
-            raise LinkError(f"{method} {path}: the board agent cannot reach the device ({text})")
-        raise ProtocolError(f"{method} {path}: the board agent reports status {reply.status} ({text})")
+            raise messages.AgentReachesNobody(request=request, why=text)
+        raise messages.AgentReports(request=request, status=reply.status, why=text)
 
     def _exchange(self, method: str, path: str) -> Reply:
         """One request, repeated under the same ID until a whole reply came. Raises: LinkError, ProtocolError."""
@@ -153,7 +153,7 @@ class SerialTransport(Transport):
         number = self._session << 16 | self._count
         frame = encode_request(number, method, path)
         if len(frame) > MAX_REQUEST:
-            raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
+            raise messages.RequestTooLong(request=f"{method} {path[:40]}...", length=len(frame), most=MAX_REQUEST)
         wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
         seconds = self._config.timeout(wait_s, self._clock)
         garbage = 0
@@ -168,18 +168,15 @@ class SerialTransport(Transport):
                 reply, seen = self._await(number, time.monotonic() + seconds)
                 garbage += seen
                 if reply is not None and reply.status == NOT_IN_CHARGE:
-                    raise LinkError(f"{method} {path}: the board agent refuses it: {_text(reply)}")
+                    raise messages.AgentRefuses(request=f"{method} {path}", why=_text(reply))
                 if reply is not None:
                     return reply
         except OSError as error:
             self.close()
-            raise LinkError(f"serial port {self.port} was lost ({error}); reopened at the next request") from error
+            raise messages.PortLost(port=self.port, error=error) from error
         self.close()  # a fresh session cannot be answered by stale replies
-        if garbage:
-            raise ProtocolError(
-                f"{method} {path}: {garbage} damaged frames on {self.port}, none whole in {self._attempts} tries"
-            )
-        raise LinkError(f"{method} {path}: no reply on {self.port} in {self._attempts} tries; is the agent running?")
+        tried = {"request": f"{method} {path}", "port": self.port, "tries": self._attempts}
+        raise messages.DamagedFrames(**tried, count=garbage) if garbage else messages.AgentSilent(**tried)
 
     def _await(self, number: int, deadline: float) -> tuple[Reply | None, int]:
         """Await the reply to the request `number`, or None when it must be repeated, and count damaged frames."""

@@ -15,7 +15,8 @@ from urllib.parse import urlsplit
 
 from conf.schema import check, setting
 from hardware.clock import Clock, DeviceClock
-from hardware.errors import LinkError, ProtocolError
+from hardware.errors import LinkError
+from hardware.link import messages
 
 __all__ = [
     "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
@@ -109,7 +110,7 @@ class SharedLink(Transport):
         asked_s, about = self._clock.now(), path.rpartition("/")[2]
         silent_s, rests_s = self._silent.get(about, (math.inf, -math.inf))
         if asked_s < max(self._again_s, rests_s):
-            raise LinkError(f"{method} {path}: not sent, a moment ago: {self._silence}")
+            raise messages.NotYetSent(request=f"{method} {path}", error=self._silence)
         try:
             reply = self._link.get(path) if method == "GET" else self._link.post(path)
         except LinkError as error:
@@ -142,7 +143,7 @@ def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff:
         found = json.loads(status)["switched_off"]
         return {m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()}
     except (ValueError, RecursionError, TypeError, AttributeError, KeyError) as error:
-        raise ProtocolError(f"the board agent's status is not readable: {status[:80]!r}") from error
+        raise messages.AgentNotReadable(what="status", said=status[:80]) from error
 
 
 @dataclass(frozen=True)
@@ -183,9 +184,11 @@ def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r
     try:
         mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()
     except OSError as error:
-        raise LinkError(f"{key} = {path}: {error.strerror}; {remedy}") from None
+        raise messages.SecretUnusable(key=key, path=path, why=error.strerror, help=remedy) from None
     if mode & 0o077:
-        raise LinkError(f"{key} = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
+        why = f"others may use it (mode {mode & 0o777:o})"
+        raise messages.SecretUnusable(key=key, path=path, why=why, help=f"chmod 600 {path}")
     if not re.fullmatch(f"{printable}{{{least},256}}", secret):
-        raise LinkError(f"{key} = {path}: not one line of {least} to 256 characters; {remedy}")
+        why = f"not one line of {least} to 256 characters"
+        raise messages.SecretUnusable(key=key, path=path, why=why, help=remedy)
     return secret

@@ -11,6 +11,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from conf.messages import Message
+from hardware.messages import DoseUnderWay, NoDose, NoNewSample
+from hardware.pioreactor import messages
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
 from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
@@ -22,7 +25,6 @@ __all__ = ["Doses", "UnitHistory", "replay"]
 
 DRAIN_ML = 4.0  # at a time and more, while a media pump runs on
 DRAINS = 5  # attempts to empty a vial after that
-UNSEEN = "its end was not on record: at most what was asked, unless its pump was found on"
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class Doses:
         self.pumps, self._book, self._config, self._clock = pumps, pumps.book, pumps.config, pumps.clock
         self.ended_s = self._due = -math.inf
         self.extra: list[Given] = []
-        self.foreign, self.refused = "", list[str]()
+        self.foreign: messages.ForeignDose | None = None
+        self.refused = list[Message]()
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
         self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
@@ -97,12 +100,12 @@ class Doses:
         feed = min(asked, self._config.max_dose_ml)
         return Plan(feed, self._config.waste_factor * feed, 0.0 if carries else self.carry_ml)
 
-    def begin(self, rate: float, sample: tuple[float, int] | None, refusal: str, pump: int = 1) -> Plan:
+    def begin(self, rate: float, sample: tuple[float, int] | None, refusal: Message | None, pump: int = 1) -> Plan:
         """Begin the dose for `sample`, or note what stands against it. Raises: as `plan`; what the log raises."""
         plan = self.plan(rate, pump)
         if reason := refusal or self._obstacle(sample):
             if plan.feed_ml > 0.0:
-                self._book.tell(f"no dose: {reason}")
+                self._book.tell(NoDose(why=reason))
             return Plan(carry_ml=self.carry_ml)
         dosing = plan.feed_ml > 0.0
         self._count += dosing
@@ -118,13 +121,12 @@ class Doses:
             self.work()
         return plan
 
-    def _obstacle(self, sample: tuple[float, int] | None) -> str:
-        stands = {
-            "no new sample": sample is None or sample == self.sample,
-            "the previous dose has not ended": self.running,
-            "a pump or a dosing job of somebody else runs": self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS),
-        }
-        return next((why for why, holds in stands.items() if holds), "")
+    def _obstacle(self, sample: tuple[float, int] | None) -> Message | None:
+        if sample is None or sample == self.sample:
+            return NoNewSample()
+        if self.running:
+            return DoseUnderWay()
+        return messages.DosedElsewhere() if self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS) else None
 
     def work(self) -> None:
         """Do what is due; called again and again."""
@@ -168,7 +170,8 @@ class Doses:
         media, waste = Moved(), Moved()
         if history.fed:
             pumps.counted[self._job, dose] = pumps.counted[WASTE, dose] = math.inf
-            media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, plan.waste_ml)
+            unseen = messages.EndUnseen()
+            media, waste = Moved(0.0, asked_ml, unseen), Moved(0.0, plan.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
                 now, ago_s = self._clock.now(), pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
                 pin = pumps.pins[self._job]
@@ -177,7 +180,9 @@ class Doses:
                 if lost := pumps.box.state(self._job).word == "lost":  # its pin may be on since, and nobody told it
                     pin.inits.append(asked.asked_s)  # no later word is that of its own process
                 seen = yield from pumps.follow(asked) if there else pumps.end(asked if lost else found)
-                media = seen._replace(low=0.0, high=max(seen.high, asked_ml), end=seen.end * bool(seen.high) or UNSEEN)
+                media = seen._replace(
+                    low=0.0, high=max(seen.high, asked_ml), end=(seen.end if seen.high else None) or unseen
+                )
         self._conclude(plan, dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
@@ -185,11 +190,11 @@ class Doses:
         for job, moved, ml in ((self._job, media, media.high), (WASTE, waste, waste.low)):
             self.pumps.counted[job, dose] = ml
             if moved.end:
-                self._book.tell(f"{NAMES[job]}: {moved.end}")
+                self._book.tell(messages.DoseEnd(pump=NAMES[job], end=moved.end))
         taken_ml, end = self._taken_ml, media.end or waste.end
         self.refused = [*self.refused, media.end] if media.end and not media.high else []
         row = Ending(on_s, media.high, taken_ml + waste.low, pump=NUMBERS[self._job], feed_low_ml=media.low).row()
-        self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=end)
+        self._book.log("dose_end", **row, waste_high_ml=taken_ml + waste.high, id=dose, end=str(end or ""))
         self._ran_on = self._ran_on or media.high > plan.feed_ml + LATE_ML
         self._fed(media.high, media.low, waste.low)
 
@@ -232,7 +237,7 @@ class Doses:
     def _portion(self, ml: float, name: str) -> Iterator[float]:
         """Have the waste pump take a portion; it counts as it is told, and in the end as it is known."""
         before_ml, course, over = self._taken_ml, self.pumps.give(WASTE, ml, name), False
-        self._book.tell(f"{ml:.1f} mL of waste: the vial is drained of what the media pump gives that runs on")
+        self._book.tell(messages.Drained(ml=ml))
         while not over:
             taken_ml = self.pumps.reported[WASTE, name]
             try:
@@ -289,8 +294,8 @@ class Doses:
             self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
 
     def _theirs(self, job: str, ml: float, who: str, beside_ml: float = 0.0) -> None:
-        self.foreign = f"{job} of {ml:.2f} mL more without our command ({who})"
-        self._give(job, ml, ml, self.foreign, beside_ml)
+        self.foreign = messages.ForeignDose(job=job, ml=ml, who=who)
+        self._give(job, ml, ml, self.foreign.sentence, beside_ml)
 
     def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
         """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
@@ -298,5 +303,5 @@ class Doses:
         waste_ml = beside_ml if fed else high_ml
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, waste_ml, NUMBERS[job])
         self.extra.append(given)
-        self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
+        self._book.tell(messages.GivenBeside(why=why, low_ml=low_ml, high_ml=high_ml))
         self._book.log("given", **given.row(why))

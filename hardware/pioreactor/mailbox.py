@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from hardware.clock import Clock
 from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.messages import MessageIgnored, OtherClient
 
 __all__ = ["CHANNELS", "DOSING_JOBS", "NAMES", "PUMPS", "SPARE", "Cluster", "Event", "Mailbox", "Pin", "Reading"]
 
@@ -113,7 +114,7 @@ class Mailbox:
         self.lock = threading.RLock()
         self.readings: deque[Reading] = deque(maxlen=KEPT)
         self.events: deque[Event] = deque(maxlen=KEPT)
-        self.ignored: list[str] = []
+        self.ignored: list[MessageIgnored] = []
         self._heard = deque[bytes](maxlen=100)
         self.jobs = dict(zip(PUMPS, config.pump_pins, strict=True))
         self.pins = {job: Pin() for job in PUMPS}
@@ -137,7 +138,7 @@ class Mailbox:
             if kind not in self._said and len(self._said) < 100:
                 self._said.add(kind)
                 why = " ".join(str(error)[:80].split()) or type(error).__name__
-                self.ignored.append(f"a message was ignored, {rest[:60]!r}: {why}")
+                self.ignored.append(MessageIgnored(topic=rest[:60], why=why))
 
     def _enter(self, experiment: str, rest: str, payload: bytes, retained: bool) -> None:
         now, mine = self._clock.now(), experiment == self._experiment
@@ -211,7 +212,7 @@ class Mailbox:
             for pin in self.pins.values():
                 pin.event_s = math.inf
 
-    def drain(self) -> tuple[list[Reading], list[Event], list[str]]:
+    def drain(self) -> tuple[list[Reading], list[Event], list[MessageIgnored]]:
         """Return readings, events, and what was ignored, since the last call."""
         with self.lock:
             found = list(self.readings), list(self.events), list(self.ignored)
@@ -272,11 +273,10 @@ class Cluster(MqttLink):
         """Tell every other client of this cluster that these units are ours, as long as we are there."""
         self.keep(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)}))
 
-    def holder(self, unit: str) -> str:
-        """Who else controls a unit, with the remedy, "" if nobody does; an earlier life of the same run is nobody."""
+    def holder(self, unit: str) -> OtherClient | None:
+        """Who else controls a unit, None if nobody does; an earlier life of the same run is nobody."""
         for topic, said in list(self._others.items()):
             if unit in said["units"]:
-                who = f"process {str(said.get('pid'))[:20]} on {str(said.get('host'))[:60]} controls {unit}"
-                remedy = f"if it is not there any more: mosquitto_pub -r -n -t {topic}"
-                return f"{who}: one client per unit; {remedy}"
-        return ""
+                pid, host = str(said.get("pid"))[:20], str(said.get("host"))[:60]
+                return OtherClient(pid=pid, host=host, unit=unit, topic=topic)
+        return None

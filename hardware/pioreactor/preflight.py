@@ -7,11 +7,12 @@ from hardware.clock import RealClock
 from hardware.errors import ReactorError
 from hardware.family import Check
 from hardware.pioreactor.mailbox import CHANNELS, DOSING_JOBS, NAMES
+from hardware.pioreactor.messages import NotHeard, PinsUntold
 from hardware.pioreactor.pumps import STEP_S
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.station import UNHEARD, PioreactorStation
+from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.versions import TESTED, facts, flow
-from hardware.pioreactor.web import Barrier, NotHeard, Web
+from hardware.pioreactor.web import Barrier, Web
 
 __all__ = ["preflight"]
 
@@ -50,8 +51,7 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
         try:
             yield Check(f"{name} {pump}", True, f"{flow(calibrations, pump):.3f} mL/s at its calibrated duty")
         except ReactorError as error:
-            detail, _, remedy = str(error).partition("; ")
-            yield Check(f"{name} {pump}", False, detail, remedy)
+            yield Check(f"{name} {pump}", False, error.sentence, error.remedy)
     try:
         settings = web.get("/config/merged")
     except NotHeard:  # an older version, of which the leader knows
@@ -74,8 +74,9 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
     remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"
     same = tube == "not set" or abs(float(tube) - unit.volume_ml) <= 0.5
     yield Check(f"{name} volume", same, f"{tube} mL in its settings, {unit.volume_ml:g} here", remedy, required=False)
-    other, _, remedy = reactors.mqtt.holder(name).partition("; ")
-    yield Check(f"{name} client", not other, other or "no other client of ours", remedy)
+    other = reactors.mqtt.holder(name)
+    seen = other.sentence if other else "no other client of ours"
+    yield Check(f"{name} client", not other, seen, other.remedy if other else "")
     dosing = sorted({str(job["job_name"]) for job in web.running()} & set(DOSING_JOBS))
     forget = facts(version).forget
     word = f"on the unit {forget} --job-name {dosing[0]}" if forget and dosing else "the unit is rebooted"
@@ -91,7 +92,7 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
         for _ in station.hear_pins():
             unit.real.sleep(STEP_S)
         heard, remedy = unit.box.dc_s > -math.inf, f"tried with {', '.join(TESTED)}; look whether stirring runs"
-        yield Check(f"{name} pins", heard, "told when one is switched" if heard else UNHEARD, remedy)
+        yield Check(f"{name} pins", heard, "told when one is switched" if heard else PinsUntold.says, remedy)
 
 
 def _experiment(name: str, wanted: str, leader: Web) -> Check:

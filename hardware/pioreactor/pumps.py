@@ -12,14 +12,18 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
+from conf.messages import Message
 from envs.bench import Bench
 from hardware.clock import Clock, DeviceClock
-from hardware.errors import LinkError, ReactorError
+from hardware.errors import ReactorError
 from hardware.logbook import Logbook
+from hardware.messages import Fault
+from hardware.pioreactor import messages
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import AUTOMATIONS, MEDIA, NAMES, PUMPS, WASTE, Cluster, Mailbox
+from hardware.pioreactor.messages import NotHeard
 from hardware.pioreactor.versions import Facts, flow
-from hardware.pioreactor.web import PROBE_S, Barrier, Calls, NotHeard, Web
+from hardware.pioreactor.web import PROBE_S, Barrier, Calls, Web
 
 __all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "Unit", "boot_of", "is_off"]
 
@@ -76,11 +80,11 @@ class Unit:
 
 
 class Moved(NamedTuple):
-    """What a pump moved, mL, at least and at most; end, in words, "" as asked."""
+    """What a pump moved, mL, at least and at most; end, what is not as asked, or None."""
 
     low: float = 0.0
     high: float = 0.0
-    end: str = ""
+    end: Message | None = None
 
 
 class Request(NamedTuple):
@@ -105,7 +109,7 @@ class Pumps:
     Attributes: jobs, of those that this run drives; ours, how every id of this run begins; short, that of a run that
       only ends with its pin off; flow_ml_s, by the active calibrations; reported, mL by job and source of the events;
       counted, mL of them that whoever asked for them books, inf while they are under way; facts, of the unit's version;
-      boot, when it was started; proven, when pumps were ended here; trouble, why no dose may be given, "" if one may;
+      boot, when it was started; proven, when pumps were ended here; trouble, why no dose may be given, None if one may;
       barred, jobs that are to end; waits, whether what is under way waits for somebody or something else; flowed_ml,
       the most that a media pump gave up to now that is not proven off, and runs_on, whether it is to be drained.
     """
@@ -118,7 +122,8 @@ class Pumps:
         self.reported = defaultdict[tuple[str, str], float](float)
         self.counted = defaultdict[tuple[str, str], float](float)
         self.facts, self.boot = Facts(), ""
-        self.trouble, self.barred, self.waits = "", tuple[str, ...](), False
+        self.trouble: Fault | None = None
+        self.barred, self.waits = tuple[str, ...](), False
         self.flowed_ml, self.runs_on, self._untold = 0.0, False, 0
         self.proven: dict[str, float] = {}
         self._calls = Calls(self.web, self.clock)
@@ -135,10 +140,6 @@ class Pumps:
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:
         """Whether the unit was started again, by its list of running jobs."""
         return boot_of(rows) not in ("", self.boot)
-
-    def unlock(self, job: str) -> str:
-        """Return the command that frees a pump's pin of the lock that a killed process left."""
-        return f"on the unit: {self.facts.purge} pwm_locks {self.box.jobs[job]} --as-int"
 
     def named(self, job: str) -> str:
         """Name a pump, and the pin behind it."""
@@ -175,9 +176,9 @@ class Pumps:
         try:
             yield from self.calibrate()
             if not self.mqtt.connected:
-                raise LinkError("no MQTT broker, so nobody would follow it")
+                raise messages.NobodyFollows()
         except ReactorError as error:
-            return Moved(end=f"not given, the next sample is dosed: {error}")
+            return Moved(end=messages.NotGiven(error=error))
         request = Request(job, round(ml, 4), dose, self.clock.now(), self.pins[job].ran_s)
         self.counted[job, dose] = math.inf
         try:
@@ -186,9 +187,9 @@ class Pumps:
             self.book.log("task", id=dose, job=job, task=request.task)
         except NotHeard as error:
             self.counted[job, dose] = 0.0
-            return Moved(end=f"not given, the next sample is dosed: {error}")
+            return Moved(end=messages.NotGiven(error=error))
         except ReactorError as error:
-            self.book.tell(f"{job}: whether it was heard is unknown: {error}")
+            self.book.tell(messages.PerhapsHeard(job=job, error=error))
         moved = yield from self.follow(request)
         self.counted[job, dose] = moved.low if job == WASTE else moved.high
         return moved
@@ -229,12 +230,13 @@ class Pumps:
         """Whether the connection to the broker was lost since a run was asked for."""
         return self.mqtt.broke_s >= request.asked_s
 
-    def _begins(self, request: Request) -> Steps[str]:
-        """Wait until a request's pump begins, then ""; or until it certainly never will, then why (as below)."""
-        job, asked_s, what = request.job, request.asked_s, f"{request.ml:.2f} mL"
+    def _begins(self, request: Request) -> Steps[Message | None]:
+        """Wait until a request's pump begins, then None; or until it certainly never will, then why (as below)."""
+        job, asked_s = request.job, request.asked_s
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
-        never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
-        fate = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
+        why: Message | None = None
+        never_s, late = math.inf, False  # from when on it cannot begin any more; whether it should have begun
+        fate = messages.FateUnknown(ml=request.ml, job=job)
         while not (
             why or self.said(request) > 0.0 or self.pins[job].on or self.pins[job].on_s >= asked_s
             or (self.box.state(job).word == "lost" and self.box.state(job).at >= asked_s)
@@ -254,16 +256,16 @@ class Pumps:
             if state.word == "disconnected" and state.at >= asked_s:
                 never_s = min(never_s, state.at + SETTLE_S)
             if now > never_s and not self.box.live(job):
-                why = f"accepted and not carried out; if its log names a lock on the pin, {self.unlock(job)}"
+                why = messages.NotCarriedOut(purge=self.facts.purge, pin=self.box.jobs[job])
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
-                why = "not carried out: the unit was started again, which forgets requests"
+                why = messages.ForgottenByRestart()
             if job in self.barred and calls.due("stop", 1.0):  # heard once the job listens
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late:
-            self.trouble, self.waits = self.trouble.replace(fate, ""), False
+            self.trouble, self.waits = None if self.trouble is fate else self.trouble, False
             if not why:
-                self.book.tell(f"{job} of {what} ran late")
+                self.book.tell(messages.RanLate(job=job, ml=request.ml))
         return why
 
     def last_word(self, request: Request) -> str:
@@ -281,15 +283,16 @@ class Pumps:
 
     def _moved(self, request: Request) -> Moved:
         """Return what a job that ended by itself gave, by its events and by how long its pin was on."""
-        flow, ml, said_ml, end = self.flow_ml_s[request.job], request.ml, self.said(request), ""
+        flow, ml, said_ml = self.flow_ml_s[request.job], request.ml, self.said(request)
+        end: Message | None = None
         low = high = said_ml
         ran_ml = (self.pins[request.job].ran_s - request.ran_s) * flow
         if said_ml < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
             slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * flow
             low, high = max(min(said_ml, ran_ml or said_ml) - slack, 0.0), min(max(said_ml, ran_ml) + slack, ml)
-            end = f"{said_ml:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"
+            end = messages.ToldLess(told_ml=said_ml, ml=ml)
         if ran_ml > high + LATE_ML:
-            end = end or f"its pin was on for {ran_ml:.2f} mL, {said_ml:.2f} mL were told"
+            end = end or messages.RanLonger(ran_ml=ran_ml, told_ml=said_ml)
         return Moved(low, max(high, round(ran_ml, 4)), end)  # a job times itself, and on a busy unit it does that late
 
     def end(self, request: Request) -> Steps[Moved]:
@@ -302,20 +305,20 @@ class Pumps:
             if late:
                 ended = "which lost the broker" if self.broke(request) else "which should have ended"
                 how = "whose process was killed or stands still" if ending.lost else ended
+                seen = {"pump": NAMES[job], "pin": self.box.jobs[job], "job": job, "how": how}
                 if heard and self.told_on(job):
-                    self.trouble = f"{self.named(job)} runs on after {job}, {how}; pull its plug, or {self.unlock(job)}"
+                    self.trouble = messages.RunsOn(**seen, purge=self.facts.purge)
                 elif ending.failed:
-                    look = "look at it; if it runs, pull its plug"
-                    self.trouble = f"{self.named(job)} may run on after {job}, {how}; {look}, or {self.unlock(job)}"
+                    self.trouble = messages.MayRunOn(**seen, purge=self.facts.purge)
                 else:
-                    self.trouble = f"{self.named(job)} is being verified off after {job}, {how}"
+                    self.trouble = messages.BeingVerified(**seen)
             self.waits = late or self.waits
             if job != WASTE:
                 self.flowed_ml = ending.flowed() if heard else 0.0
                 drain = late or (self.box.state(job).word == "lost" and pin.on) or self._beyond(request) > 0.0
                 self.runs_on = self.flowed_ml > 0.0 and drain
             yield STEP_S
-        self.trouble, self.waits, self.runs_on = "", False, False
+        self.trouble, self.waits, self.runs_on = None, False, False
         self.proven[job] = self.clock.now()
         return ending.moved(off_s)
 
@@ -444,11 +447,12 @@ class ForcedEnd:
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
         if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
             ran = longest
-        low, end = max(said_ml - ROUNDED_S * flow, 0.0), "ended from here"
+        low, end = max(said_ml - ROUNDED_S * flow, 0.0), messages.EndedFromHere()
         if ran <= 0.0:  # its pin was never seen: a job times itself
             return Moved(low, max(ml, said_ml), end)
         if self._rebooted:
-            return Moved(low, max(ran, min(ml, ran + p.config.reading_s * flow)), "the unit was started again in it")
+            most = max(ran, min(ml, ran + p.config.reading_s * flow))
+            return Moved(low, most, messages.StartedAgainInDose())
         if p.broke(self._request) and not self.lost:  # a job that loses the broker ends; when was not heard
             ran = min(ran, max(ml, said_ml))
         return Moved(low, max(ran, said_ml), end)

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from envs.bench import Bench
 from hardware.clock import Clock, DeviceClock
-from hardware.errors import DeviceStateError, LinkError, ReactorError
+from hardware.errors import ReactorError
 from hardware.logbook import Log, Logbook, no_log
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import UnitHistory
 from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.pioreactor.messages import BrokerRefuses, UnitTaken
 from hardware.pioreactor.pumps import Unit
 from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.web import Web
@@ -56,12 +57,12 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         self.connect()
         self.mqtt.hold()
         if others := [other for unit in self.names if (other := self.mqtt.holder(unit))]:
-            raise DeviceStateError(others[0])
+            raise UnitTaken(other=others[0])
         past = {station: histories.get(station.name, UnitHistory()) for station in self.stations}
         failed = self._all(self.stations, lambda station: station.bring_up(past[station]))
         for station, error in failed.items():
             if not histories or len(failed) == len(past):
-                raise type(error)(f"{station.name}: {error}")
+                raise error.about(station.name)
             screen.warning("%s: not taken over, the others go on: %s", station.name, error)
             station.lie_down(error, past[station])
 
@@ -71,8 +72,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         while not self.mqtt.connected:
             if self._real.now() > deadline or self.mqtt.refusal:
                 why = self.mqtt.refusal or f"no answer in {FIRST_S:.0f} s"
-                remedy = "check backend.username, and its password in backend.password_file or the environment"
-                raise LinkError(f"MQTT broker {self.config.broker}:{self.config.broker_port}: {why}; {remedy}")
+                raise BrokerRefuses(broker=f"{self.config.broker}:{self.config.broker_port}", why=why)
             self._real.sleep(LOOK_S)
         self._real.sleep(1.0)
 

@@ -8,24 +8,25 @@ import math
 from collections.abc import Iterator
 from contextlib import suppress
 
-from hardware.errors import DeviceStateError, LinkError, ReactorError
+from conf.messages import Message
+from hardware.errors import ReactorError
+from hardware.messages import Fault, UndosedFault
+from hardware.pioreactor import messages
 from hardware.pioreactor.doses import Doses, UnitHistory
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts, regulates, request, target_of
 from hardware.pioreactor.web import Barrier, Calls
-from hardware.reactor import Fault
 from hardware.stations import Newest, Plan
 
-__all__ = ["UNHEARD", "PioreactorStation"]
+__all__ = ["PioreactorStation"]
 
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
 RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
-UNHEARD = "the unit told nothing of its pins when one was switched, so no dose could be followed"
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
@@ -67,13 +68,12 @@ class PioreactorStation:
         if history.boot not in ("", self._pumps.boot):  # which sets all pins to 0
             self._pumps.proven = dict.fromkeys(self._pumps.jobs, self._real.now())
         if AUTOMATION in self._listed and not self.handed_over:
-            raise DeviceStateError("a dosing automation of the vendor's runs, and would dose too; stop it in its page")
+            raise messages.AutomationRuns()
         self.doses.restore(history)
         barrier, deadline = Barrier(self._web, self._real), self._real.now() + GRACE_S
         while not (history.open or self.handed_over or barrier.passed()):
             if self._real.now() > deadline:
-                huey = "sudo systemctl restart huey"
-                raise LinkError(f"the task queue takes nothing, so a dose would run at any time; on the unit: {huey}")
+                raise messages.QueueStuck()
             yield STEP_S
         target = history.temperature if math.isfinite(history.temperature) else self._config.temperature
         self._target, self._target_sent_s = target if self._config.thermostat else math.nan, -math.inf
@@ -101,7 +101,7 @@ class PioreactorStation:
 
     def lie_down(self, error: ReactorError, history: UnitHistory) -> None:
         """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
-        self.book.report(Fault("link", str(error), "the others go on, and this one is tried again"))
+        self.book.report(messages.NotBroughtUp(error=error))
         self._course = self._rise(history)
 
     def _rise(self, history: UnitHistory) -> Iterator[float]:
@@ -150,7 +150,7 @@ class PioreactorStation:
             self._astray = said[0]
         unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
         if unsent and (said := self._calls.ask("level", RESEND_S, self._web.set_level, self.level_ml)):
-            self.book.tell(f"its own ledger: {said[0] or f'{self.level_ml:g} mL'}")
+            self.book.tell(messages.LedgerSet(level=said[0] or f"{self.level_ml:g} mL"))
             self.level_ml = math.nan
         if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", RESEND_S):
             self._pumps.ask_pins()
@@ -188,37 +188,32 @@ class PioreactorStation:
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
         if not self._mqtt.connected:
-            lost = f"no MQTT broker at {self._config.broker}: {self._mqtt.lost or 'nothing comes'}"
-            return Fault("link", lost, "on the leader: power, network, sudo systemctl restart mosquitto; doses wait")
-        if self._pumps.trouble:
-            return Fault("pump", self._pumps.trouble, "nothing is dosed until that is known")
-        if other := self._mqtt.holder(self.name):
-            who, _, done = other.partition("; ")
-            return Fault("mode", who, done)
+            return messages.NoBroker(broker=self._config.broker, why=self._mqtt.lost or "nothing comes")
+        if found := self._pumps.trouble or self._mqtt.holder(self.name):
+            return found
         theirs = [job for job in AUTOMATIONS if self._box.live(job)]
         if self._astray:
-            return Fault("mode", self._astray, f"assign it to {self._config.experiment}, active, in the vendor's page")
+            return messages.Astray(why=self._astray, experiment=self._config.experiment)
         if theirs and not (self.handed_over and theirs == [AUTOMATION]):
-            return Fault("mode", f"{theirs[0]} of the vendor's runs", "stop it in the vendor's page; it is counted")
+            return messages.VendorDoses(job=theirs[0])
         if self.doses.foreign and not self.handed_over:
-            return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
+            return self.doses.foreign
         if job := next((job for job in self._wanted() if job in self._gone), ""):
-            forget = self._pumps.facts.forget
-            word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
             twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
             again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
-            what, remedy = f"the unit {GONE[job]}", f"{again}; a killed job blocks restarts, on the unit: {word}"
             if job == OD and (said := self._box.complaint):
-                what, remedy = f"{what}, its log says: {said}", "do what that says, else reboot the unit; doses wait"
-            elif self._real.now() > self._box.heard_s + SILENT_S:
-                what, remedy = f"{what}, nor says anything", f"look at its power and network; {again}"
-            return Fault("stopped", what, remedy)
+                return messages.ReaderComplains(log=said)
+            if self._real.now() > self._box.heard_s + SILENT_S:
+                return messages.UnitSilent(gone=GONE[job], again=again)
+            forget = self._pumps.facts.forget
+            command = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
+            return messages.JobGone(gone=GONE[job], again=again, command=command)
         if self._listened and math.isinf(self._box.dc_s):
-            return Fault("pump", UNHEARD, "stop and start stirring in the vendor's page, else reboot the unit")
+            return messages.PinsUntold()
         since_s, why = self._calls.failed.get("rows", (math.inf, ""))
         if self._real.now() > since_s + GRACE_S:
-            return Fault("link", f"its web server: {why}", "doses wait")
-        return Fault("undosed", self.doses.refused[-1], "tried again") if self.doses.refused[1:] else None
+            return messages.WebServerSilent(why=why)
+        return messages.DoseNotTaken(why=self.doses.refused[-1]) if self.doses.refused[1:] else None
 
     def _wanted(self) -> list[str]:
         """List the jobs that this run keeps going."""
@@ -256,17 +251,19 @@ class PioreactorStation:
 
     def dose(self, rate: float, pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
-        stands = {
-            "the unit was given up": self.given_up,
-            "the unit regulates itself": self.handed_over,
-            str(self.book.fault): self.book.fault is not None and self.book.fault.kind != "undosed",
-            "its sample is stale": self._clock.now() - self.sampling.at > self.unit.bench.stale_s,
-            UNHEARD: math.isinf(self._box.dc_s),
-        }
-        refusal = next((why for why, holds in stands.items() if holds), "")
+        fault = self.book.fault
+        refusal: Message | None = None if isinstance(fault, UndosedFault) else fault
+        if self.given_up:
+            refusal = messages.GivenUp()
+        elif self.handed_over:
+            refusal = messages.RegulatesItself()
+        elif refusal is None and self._clock.now() - self.sampling.at > self.unit.bench.stale_s:
+            refusal = messages.SampleStale()
+        elif refusal is None and math.isinf(self._box.dc_s):
+            refusal = messages.PinsUntold()
         key = (round(self.sampling.at, 3), self.sampling.count) if self.sampling.count else None
         plan = self.doses.begin(rate, key, refusal, pump)
-        self.doses.foreign = ""
+        self.doses.foreign = None
         return plan
 
     def set_temperature(self, target: float) -> None:
@@ -301,10 +298,11 @@ class PioreactorStation:
                 if self._real.now() > deadline or (pumps.trouble and not final):
                     heard = box.heard_s > self._real.now() - PUMPS_S
                     on = [pumps.named(job) for job in PUMPS if heard and pumps.told_on(job)]
-                    off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
-                    seen = f"{on[0]} on; pull its plug" if on else f"not verified off; {off}"
                     why = (pumps.trouble or "look at the unit's log") if self._mqtt.connected else "no broker to ask"
-                    raise DeviceStateError(f"pumps of {self.name}: {seen}. {why}")
+                    if on:
+                        raise messages.UnitPumpOn(unit=self.name, pump=on[0], why=why)
+                    off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
+                    raise messages.UnitPumpsUnproven(unit=self.name, why=why, off=off)
                 self.go_on()
                 yield STEP_S
         finally:
@@ -327,7 +325,7 @@ class PioreactorStation:
         deadline = self._real.now() + 8.0
         while self._box.live(job):
             if self._real.now() > deadline:
-                raise DeviceStateError(f"{job} of {self.name} does not end; stop it in the vendor's page")
+                raise messages.JobDoesNotEnd(job=job, unit=self.name)
             if self._calls.due(f"end {job}", 1.0):
                 self.unit.say(f"{job}/$state/set", "disconnected")
             self._calls.ask(f"stop {job}", 4.0, self._web.stop, job)
@@ -342,7 +340,7 @@ class PioreactorStation:
             deadline, ready_s, settings = self._real.now() + GRACE_S, math.inf, None
             while not (self._real.now() > ready_s + SETTLED_S and regulates(settings, asked)):
                 if self._real.now() > deadline:
-                    raise DeviceStateError("the vendor's turbidostat does not regulate; look at its log")
+                    raise messages.DoesNotRegulate()
                 ready = self._box.state(AUTOMATION).word == "ready"
                 ready_s = min(ready_s, self._real.now()) if ready else math.inf
                 if said := self._calls.ask("settings", 0.5, self._web.get, f"/jobs/settings/job_name/{AUTOMATION}"):

@@ -5,8 +5,8 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.messages import NotCalibrated
 
 __all__ = ["GONE", "TESTED", "Facts", "facts", "flow", "number", "regulates", "request", "target_of"]
 
@@ -90,7 +90,7 @@ def regulates(settings: Any, asked: dict[str, Any]) -> bool:
 
 
 def flow(calibrations: Any, pump: str) -> float:
-    """Return mL per second at the calibrated duty. Raises: DeviceStateError without a usable calibration.
+    """Return mL per second at the calibrated duty. Raises: NotCalibrated.
 
     A line is a list [slope, intercept], or in newer versions {type: poly, coefficients: [slope, intercept]}; of other
     curves the slope is that of the line through 0 that fits what was weighed.
@@ -105,6 +105,5 @@ def flow(calibrations: Any, pump: str) -> float:
     except (KeyError, TypeError, IndexError, ValueError, ZeroDivisionError):
         slope = math.nan
     if not (slope > 0.0 and math.isfinite(slope)):
-        remedy = f"calibrate it in the vendor's page (Calibrations, {pump}); doses in mL are refused without"
-        raise DeviceStateError(f"no active calibration of the {pump} that gives mL per second; {remedy}")
+        raise NotCalibrated(pump=pump)
     return slope

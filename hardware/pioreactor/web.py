@@ -13,18 +13,15 @@ import httpx
 from hardware.clock import Clock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.http import fetch
+from hardware.pioreactor import messages
+from hardware.pioreactor.messages import NotHeard
 
-__all__ = ["PROBE_S", "Barrier", "Calls", "NotHeard", "Web"]
+__all__ = ["PROBE_S", "Barrier", "Calls", "Web"]
 
 T = TypeVar("T")
 
-REMEDY = "if that stays, on the unit: sudo systemctl restart pioreactor-web.target"
 PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused
 OVER = ("complete", "succeeded", "failed")  # states of a task that was taken and is over, in whatever version
-
-
-class NotHeard(LinkError):
-    """A request that certainly was not carried out: nobody was reached, or it was turned away."""
 
 
 class Web:
@@ -50,7 +47,7 @@ class Web:
         body = {"options": options, "args": [], "env": self._env, "config_overrides": overrides}
         answer = self.send("POST", f"/jobs/run/job_name/{job}", body)
         if not (isinstance(answer, dict) and isinstance(answer.get("task_id"), str)):
-            raise ProtocolError(f"{self.url}: answered {str(answer)[:60]} to {job}, expected a task_id")
+            raise messages.UnknownReply(url=self.url, what=f"answered {str(answer)[:60]} to {job}, expected a task_id")
         return str(answer["task_id"])
 
     def stop(self, job: str) -> None:
@@ -63,7 +60,7 @@ class Web:
         try:
             self.send("PATCH", path, {"values": {"current_volume_ml": level_ml}})
         except NotHeard as error:
-            if "status" not in str(error):
+            if "status" not in error.fields:
                 raise
             return str(error)
         return ""
@@ -73,7 +70,7 @@ class Web:
         try:
             said = self.get(f"/workers/{unit}/experiment", below="/api")
         except NotHeard as error:
-            if "status 404" not in str(error):
+            if error.fields.get("status") != 404:
                 raise
             return "the leader knows no experiment that it is in"
         if (found := str(said.get("experiment"))) != self._experiment:
@@ -85,7 +82,7 @@ class Web:
         try:
             answer = self.get(f"/task_results/{task}")
         except ProtocolError as error:
-            if "status 500" in str(error):
+            if error.fields.get("status") == 500:
                 return True
             raise
         if not (isinstance(answer, dict) and answer.get("status") in OVER):
@@ -98,7 +95,7 @@ class Web:
         """Get the vendor's list of running jobs, and of killed ones. Raises: LinkError, ProtocolError."""
         jobs = self.get("/jobs/running")
         if not (isinstance(jobs, list) and all(isinstance(job, dict) and "job_name" in job for job in jobs)):
-            raise ProtocolError(f"{self.url}: {str(jobs)[:60]} is no list of jobs")
+            raise messages.UnknownReply(url=self.url, what=f"{str(jobs)[:60]} is no list of jobs")
         return jobs
 
     def send(self, method: str, path: str, body: Mapping[str, Any] | None, below: str = "/unit_api") -> Any:
@@ -108,23 +105,21 @@ class Web:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
         except LinkError as error:
             nobody = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
-            what, _, _ = str(error).partition("; ")  # and words of another family
-            raise (NotHeard if nobody else LinkError)(
-                f"{what}; check the unit's power and network, {REMEDY}"
-            ) from error
+            said_so = messages.NobodyReached if nobody else messages.NoReply  # without the remedy of another family
+            raise said_so(error=error.sentence) from error
         try:
             answer = json.loads(said or b"null")
         except (ValueError, RecursionError):
             answer = said[:400].decode("utf-8", "replace")
             if status < 300:
-                raise ProtocolError(f"{url}: not JSON: {answer[:60]!r}") from None
+                raise messages.UnknownReply(url=url, what=f"not JSON: {answer[:60]!r}") from None
         if status < 300:
             return answer
         reason = answer.get("error", answer) if isinstance(answer, dict) else answer
         if str(reason).lstrip().startswith("<"):  # a page for people
             reason = responses.get(status, "a page")
-        text = f"{url}: its web server answered with status {status}: {' '.join(str(reason).split())[:160]}"
-        raise NotHeard(text) if 400 <= status < 500 else ProtocolError(f"{text}; {REMEDY}")
+        failed = messages.TurnedAway if 400 <= status < 500 else messages.ServerFailed
+        raise failed(url=url, status=status, reason=" ".join(str(reason).split())[:160])
 
     def close(self) -> None:
         """Idempotent; a request that hangs is left to its time-out."""

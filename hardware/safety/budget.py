@@ -5,7 +5,9 @@ import math
 import numpy as np
 
 from envs.bench import Bench
+from hardware.messages import Fault
 from hardware.reactor import Array, Mask
+from hardware.safety import messages
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
 
@@ -46,25 +48,24 @@ class FeedBudget:
         lost = unusable & (self._unusable >= c.controller_patience)
         wanted = np.where(fresh & ~unusable, rate, 0.0)
         undosed = fresh & (self._owed_ml > 2.0 * bench.max_rate * bench.period_s)
-        in_a_row, owed, most = self._unusable, self._owed_ml, bench.max_rate
+        most = bench.max_rate
         findings = [
-            Finding("controller", unusable & ~lost, lambda i: f"proposed {rate[i]:g} mL/s"),
-            Finding("controller_lost", lost, lambda i: f"{in_a_row[i]:.0f} unusable proposals in a row"),
-            Finding("limit", wanted > most * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {most:g}"),
-            Finding("undosed", undosed, lambda i: f"{owed[i]:.2f} mL were allowed, nothing was dosed"),
+            Finding(messages.ControllerFault, unusable & ~lost, {"rate": rate}),
+            Finding(messages.ControllerLostFault, lost, {"count": self._unusable}),
+            Finding(messages.LimitFault, wanted > most * (1.0 + 1e-9), {"rate": wanted, "most": most}),
+            Finding(messages.DosesNotTaken, undosed, {"owed_ml": self._owed_ml}),
         ]
         allowed = np.minimum(wanted, most)
-        for kind, room in self._room(now).items():
+        for fault, room in self._room(now).items():
             asked = allowed * bench.period_s
             over = asked > room + 1e-9
-            if kind == "budget":  # a repetition may overdraw it; where nothing is asked, nothing is refused
+            if fault is messages.BudgetFault:  # a repetition may overdraw it; nothing asked is nothing refused
                 over &= asked > 0.0
-            texts = [f"{max(r, 0.0):.2f} mL left, {a:.2f} asked" for r, a in zip(room, asked, strict=True)]
-            findings.append(Finding(kind, over, texts.__getitem__))
+            findings.append(Finding(fault, over, {"left_ml": np.maximum(room, 0.0), "asked_ml": asked}))
             allowed = np.where(over, 0.0, allowed)
         return allowed, findings
 
-    def _room(self, now: float) -> dict[str, Array]:
+    def _room(self, now: float) -> dict[type[Fault], Array]:
         """Return the mL that may still be fed, by what limits them, shape (N,) each."""
         c = self._config
         self._roll(now)
@@ -72,9 +73,9 @@ class FeedBudget:
         per_minute = c.ml_a_minute(self._bench)
         left = [per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
         return {
-            "budget": np.minimum.reduce(left),
-            "bottle": self.bottle_ml - self.fed_ml,
-            "overflow": self._full_ml - self.volume_ml,
+            messages.BudgetFault: np.minimum.reduce(left),
+            messages.BottleFault: self.bottle_ml - self.fed_ml,
+            messages.OverflowFault: self._full_ml - self.volume_ml,
         }
 
     def _roll(self, now: float) -> None:

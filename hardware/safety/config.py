@@ -1,4 +1,4 @@
-"""Limits and declared responses of the interlock, and the remedy for each of its reasons."""
+"""Limits and responses of the interlock."""
 
 import math
 from dataclasses import dataclass
@@ -6,10 +6,11 @@ from enum import IntEnum
 
 from conf.schema import check, part, require, setting
 from envs.bench import Bench
+from hardware.messages import Fault
+from hardware.safety.messages import BudgetFault, FallsFault, FluorescenceLostFault, JumpFault, NoDilutionFault
 
 __all__ = [
-    "DONE", "MAX_SETPOINT", "RAW_MAX", "RAW_MIN", "REMEDIES", "RESPONSES", "WORDS", "Response", "Responses",
-    "SafetyConfig",
+    "DONE", "MAX_SETPOINT", "RAW_MAX", "RAW_MIN", "WORDS", "Response", "Responses", "SafetyConfig",
 ]  # fmt: skip
 
 
@@ -32,74 +33,6 @@ NOT_REGULATE = ("report", "hold", "pumps_off", "stop")
 _DONE = ("reported", "no dose", "pumps off", "handed over to the on-board regulation", "stopped")
 DONE = dict(zip(Response, _DONE, strict=True))
 
-REMEDIES = {
-    "setpoint": "correct the schedule: setpoints are OD over 0 and at most the configured maximum",
-    "controller": "look at the policy's input and output in the journal",
-    "controller_lost": "replace the policy, then start a new run",
-    "limit": "nothing if the controller asked too much; else raise bench.max_rate",
-    "budget": "check for a leak or wash-out; if the flow is right, raise safety.ml_per_hour or ml_per_run",
-    "bottle": "fill the bottle, then: python -m experiments.mark run=RUN reactor=NAME bottle_ml=ML",
-    "overflow": "check waste pump and tube",
-    "undosed": "look at the run's notes for why doses are not given: link too slow, device not as set",
-    "impossible": "check cable, vial and blank",
-    "spectrometer": "check the spectrometer's cable; restart the device if it persists",
-    "frozen": "look at the device's terminal: its measuring thread may be dead",
-    "jump": "check for bubbles, foam and a moved vial",
-    "no_dilution": "check bottle (filled: mark it, bottle_ml=ML), feed tube, gasket; clean the vial's wall",
-    "cannot_hold": "the culture outgrows the pump, or the pump has become weak: weigh its doses, check gasket and tube",
-    "falls": "check for a pump that runs on, a leak, a stopped stirrer",
-    "stale": "check link and device",
-    "lost": "check link and device; pumps are swept off as soon as it answers",
-    "silent": "repair the link or the device, then start a new run; a stopped reactor stays so when resumed",
-    "hot": "check heater and thermometer; heating stays off in this run",
-    "thermometer": "check that the vial is seated; heating stays off in this run",
-    "device": "see the text",
-    "fluorescence": "check LED, spectrometer and the slot's gain",
-    "fluorescence_lost": "what it tells is not seen: check LED and spectrometer, then look at the device's FP slot",
-    "command_limit": "nothing if the law asked for too much; else set safety.composition_low and composition_high",
-}
-RESPONSES = {
-    "setpoint": "hold",  # outside (0, MAX_SETPOINT]
-    "controller": "hold",  # proposed rate negative or no number
-    "controller_lost": "regulate",  # too many unusable proposals in a row
-    "limit": "report",  # proposed more than max_rate: cut
-    "budget": "hold",  # a feed budget is used up
-    "bottle": "hold",  # the bottle is empty by the ledger
-    "overflow": "pumps_off",  # the vial overflows by the ledger
-    "undosed": "report",  # doses are allowed but the device gets none
-    "impossible": "hold",  # OD or counts that no culture has
-    "spectrometer": "pumps_off",  # OD 12 to 14
-    "frozen": "hold",  # the same reading again and again
-    "jump": "hold",  # a step that neither growth nor dose explains
-    "no_dilution": "hold",  # the pump ran but OD did not fall
-    "cannot_hold": "report",  # full feed does not bring OD to the setpoint; lasts as long as that
-    "falls": "pumps_off",  # OD falls without pump
-    "stale": "hold",  # the newest sample is older than stale_s
-    "lost": "pumps_off",  # and older than lost_s
-    "silent": "stop",  # nothing for `silent` minutes
-    "hot": "hold",  # too warm; the heater is switched off as well
-    "thermometer": "report",  # reads nonsense; the heater is switched off
-    "fluorescence": "report",  # none, none at all, full scale or frozen
-    "fluorescence_lost": "report",  # and for more than light_lost minutes
-    "command_limit": "report",  # what a signal asked of an actuator was out of range: cut
-    # kinds of `reactor.Fault`
-    "link": "hold",  # no answer
-    "selection": "hold",  # the device addresses another reactor
-    "identity": "stop",  # another device than the run began with
-    "absent": "hold",  # no reactor at this position
-    "restarted": "hold",  # the device lost its memory
-    "stopped": "pumps_off",  # the experiment no longer runs
-    "stalled": "hold",  # the experiment takes no samples
-    "mode": "hold",  # the device regulates or runs something by itself
-    "blank": "hold",  # the blank is not the run's
-    "pump": "pumps_off",  # a pump runs that should not
-    "overflow_pump": "hold",  # an overflow pump is configured and cannot be verified on
-}
-"""The declared response to every reason, a word of `WORDS`.
-
-A reason that means the sensor cannot be believed may not regulate: the device would pump by the same reading.
-"""
-
 MAX_SETPOINT = 1.5  # OD; a larger one is a typing error
 RAW_MIN, RAW_MAX = 5.0, 65534.0  # counts: a failed spectrometer reads 1, a saturated one 65535
 
@@ -112,12 +45,12 @@ class Responses:
     device's own regulation for good. stop: no dose in this run any more.
     """
 
-    budget: str = setting(RESPONSES["budget"], "a feed budget is used up", choices=tuple(WORDS)[1:])
-    jump: str = setting(RESPONSES["jump"], "a step that neither growth nor a dose explains", choices=NOT_REGULATE)
-    no_dilution: str = setting(RESPONSES["no_dilution"], "the pump ran but the OD did not fall", choices=NOT_REGULATE)
-    falls: str = setting(RESPONSES["falls"], "the OD falls without a dose", choices=NOT_REGULATE[1:])
+    budget: str = setting(BudgetFault.response, "a feed budget is used up", choices=tuple(WORDS)[1:])
+    jump: str = setting(JumpFault.response, "a step that neither growth nor a dose explains", choices=NOT_REGULATE)
+    no_dilution: str = setting(NoDilutionFault.response, "the pump ran but the OD did not fall", choices=NOT_REGULATE)
+    falls: str = setting(FallsFault.response, "the OD falls without a dose", choices=NOT_REGULATE[1:])
     fluorescence_lost: str = setting(
-        RESPONSES["fluorescence_lost"], "no valid fluorescence for more than light_lost minutes",
+        FluorescenceLostFault.response, "no valid fluorescence for more than light_lost minutes",
         choices=tuple(WORDS),
     )  # fmt: skip
 
@@ -187,9 +120,9 @@ class SafetyConfig:
         low, high = self.targets
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
-    def response(self, kind: str) -> Response:
-        """Return the response to a reason. Raises: KeyError if there is none of that name."""
-        return WORDS[getattr(self.responses, kind, RESPONSES[kind])]
+    def response(self, fault: Fault | type[Fault]) -> Response:
+        """Return the response to a fault: what the lab chose, else what the fault declares."""
+        return WORDS[getattr(self.responses, fault.kind, fault.response)]
 
     def ml_a_minute(self, bench: Bench) -> float:
         """Feed budget of a minute, mL."""

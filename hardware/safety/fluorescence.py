@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from hardware.reactor import Array, Mask, Measurement
+from hardware.safety import messages
 from hardware.safety.config import RAW_MAX, SafetyConfig
 from hardware.safety.readings import Finding
 
@@ -36,12 +37,10 @@ class Light:
         minutes = (now - self._light_s) / 60.0
         lost = fresh & (minutes > self._config.light_lost)
         return [
-            Finding("fluorescence", fresh & ~believed & ~lost, lambda i: _words(counts[i], repeats[i])),
             Finding(
-                "fluorescence_lost",
-                lost,
-                lambda i: f"no reading to believe for {minutes[i]:.0f} min, {_words(counts[i], repeats[i])}",
+                messages.FluorescenceFault, fresh & ~believed & ~lost, {"counts": counts, "samples": repeats + 1.0}
             ),
+            Finding(messages.FluorescenceLostFault, lost, {"minutes": minutes, "counts": counts}),
         ]
 
     def believed(self, m: Measurement) -> Array | None:
@@ -57,10 +56,3 @@ class Light:
         repeats = np.where(fresh, np.where(counts == self._light, self._light_repeats + 1, 0), self._light_repeats)
         inside = (counts >= c.light_min) & (counts <= RAW_MAX)  # not nan
         return np.asarray(fresh & inside & (repeats < c.frozen_light - 1), dtype=np.bool_), repeats
-
-
-def _words(counts: float, repeats: float) -> str:
-    """Put a reading into words."""
-    if math.isnan(counts):
-        return "no counts"
-    return f"{counts:.0f} counts" + (f", the same in {repeats + 1:.0f} samples" if repeats else "")

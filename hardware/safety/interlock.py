@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from envs.bench import Bench
 from hardware import memory
 from hardware.actuator import THERMOSTAT, Actuator
+from hardware.messages import Fault
 from hardware.reactor import Array, Mask, Measurement, Receipt
+from hardware.safety import messages
 from hardware.safety.budget import FeedBudget
-from hardware.safety.config import DONE, MAX_SETPOINT, REMEDIES, Response, SafetyConfig
+from hardware.safety.config import DONE, MAX_SETPOINT, Response, SafetyConfig
 from hardware.safety.fluorescence import Light
+from hardware.safety.messages import PAUSES
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
@@ -35,7 +38,7 @@ class Ruling:
     rate: allowed feed rate, mL/s, shape (N,); 0 for every row that is not fresh or is held.
     response: a `Response` per reactor, shape (N,).
     reasons: per reactor None, or reason, action taken and remedy in one line.
-    kinds: per reactor the reasons' names.
+    faults: per reactor what was found.
     heat_off: reactors whose heating must be off, shape (N,).
     setpoint: a sane target for the on-board regulation, shape (N,).
     """
@@ -43,9 +46,14 @@ class Ruling:
     rate: Array
     response: NDArray[np.int64]
     reasons: list[str | None]
-    kinds: tuple[tuple[str, ...], ...]
+    faults: tuple[tuple[Fault, ...], ...]
     heat_off: Mask
     setpoint: Array
+
+    @property
+    def kinds(self) -> tuple[tuple[str, ...], ...]:
+        """Per reactor the kinds of its faults."""
+        return tuple(tuple(fault.kind for fault in faults) for faults in self.faults)
 
 
 class Interlock:
@@ -77,7 +85,7 @@ class Interlock:
         self._parts = (self.budget, self._readings, self._change, self._heat, self._light)
         self._cut: dict[str, Finding] = {}  # commands out of range, until `check` has told of them
         self._hold_until_s = np.full(n, -math.inf)
-        self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
+        self._hold_kind = np.full(n, -1.0)  # index into PAUSES
         self._latched = np.zeros(n)  # a `Response` that no later one may fall below
 
     def check(
@@ -99,7 +107,7 @@ class Interlock:
         of_changes = self._change.check(measurement.od, measurement.time_s, believed, setpoint)
         of_heat = self._heat.check(measurement.temperature, fresh, target_c, now)
         sound = (setpoint > 0.0) & (setpoint <= MAX_SETPOINT)
-        of_setpoint = Finding("setpoint", ~sound, lambda i: f"setpoint {setpoint[i]:g}")
+        of_setpoint = Finding(messages.SetpointFault, ~sound, {"setpoint": setpoint, "most": MAX_SETPOINT})
         allowed, of_rates = self.budget.check(rate, fresh, now)
         found = self._reported(measurement)
         of_light = self._light.check(measurement, now)
@@ -115,7 +123,7 @@ class Interlock:
         A step that nothing explains may be only where `jump` is no more than reported.
         """
         believed = self._readings.believed(measurement, np.asarray(measurement.fresh, dtype=np.bool_))
-        if self.config.response("jump") is Response.PASS:
+        if self.config.response(messages.JumpFault) is Response.PASS:
             return believed
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
 
@@ -138,58 +146,51 @@ class Interlock:
             low, high = self.config.targets
         asked = np.asarray(asked, dtype=np.float64)
         allowed = np.clip(asked, low, high)
-        limits = f"allowed {low:g} to {high:g}"
-        self._cut[actuator.name] = Finding(
-            "command_limit",
-            ~np.isnan(asked) & (allowed != asked),
-            lambda i: f"{actuator.name}: {asked[i]:.4g} {actuator.unit} asked, {limits}",
-        )
+        seen = {"actuator": actuator.name, "asked": asked, "unit": actuator.unit, "low": low, "high": high}
+        cut = ~np.isnan(asked) & (allowed != asked)
+        self._cut[actuator.name] = Finding(messages.CommandLimitFault, cut, seen)
         return np.asarray(allowed)
 
-    def _reported(self, m: Measurement) -> list[list[_Reason]]:
+    def _reported(self, m: Measurement) -> list[list[Fault]]:
         """Collect the faults that the reactors report themselves."""
         faults = m.vitals.faults if m.vitals is not None else (None,) * self.n
-        return [
-            [_Reason(f.kind, self.config.response(f.kind), f"{f.detail}; {f.remedy}")] if f is not None else []
-            for f in faults
-        ]
+        return [[fault] if fault is not None else [] for fault in faults]
 
-    def _collect(self, found: list[list[_Reason]], findings: Sequence[Finding], now: float) -> None:
-        """Add the findings to each reactor's reasons; some begin a while without a dose."""
+    def _collect(self, found: list[list[Fault]], findings: Sequence[Finding], now: float) -> None:
+        """Add the findings to each reactor's faults; some begin a while without a dose."""
         for finding in findings:
-            response = self.config.response(finding.kind)
             for i in np.flatnonzero(finding.rows):
-                found[i].append(_Reason(finding.kind, response, finding.text(int(i))))
-            if finding.cool is not None and response is not Response.PASS:
-                until = now + 60.0 * self.config.cooldown
-                self._hold_until_s = np.where(finding.cool, until, self._hold_until_s)
-                self._hold_kind = np.where(finding.cool, float(list(REMEDIES).index(finding.kind)), self._hold_kind)
+                found[i].append(finding.of(int(i)))
+            if finding.cool is not None and self.config.response(finding.fault) is not Response.PASS:
+                pause = next(k for k, pause in enumerate(PAUSES) if pause.kind == finding.fault.kind)
+                self._hold_until_s = np.where(finding.cool, now + 60.0 * self.config.cooldown, self._hold_until_s)
+                self._hold_kind = np.where(finding.cool, float(pause), self._hold_kind)
 
-    def _add_holds(self, found: list[list[_Reason]], fresh: Mask, now: float) -> None:
-        """Add a reason to hold, where one was given a while ago and is not given again now."""
+    def _add_holds(self, found: list[list[Fault]], fresh: Mask, now: float) -> None:
+        """Add a pause, where its fault was found a while ago and is not found again now."""
         for i in np.flatnonzero(fresh & (now < self._hold_until_s)):
-            kind = list(REMEDIES)[int(self._hold_kind[i])]
-            if kind not in [reason.kind for reason in found[i]]:
-                wait = (self._hold_until_s[i] - now) / 60.0
-                found[i].append(_Reason(kind, Response.HOLD, f"no dose for another {wait:.1f} min after this"))
+            pause = PAUSES[int(self._hold_kind[i])]
+            if pause.kind not in [fault.kind for fault in found[i]]:
+                found[i].append(pause(minutes=float(self._hold_until_s[i] - now) / 60.0))
 
-    def _conclude(self, found: list[list[_Reason]], allowed: Array, setpoint: Array) -> Ruling:
+    def _conclude(self, found: list[list[Fault]], allowed: Array, setpoint: Array) -> Ruling:
         """Choose the most severe response per reactor, never below what is latched."""
-        response = np.array(
-            [max((reason.response for reason in reasons), default=0) for reasons in found], dtype=np.int64
-        )
+        response = np.array([max(map(self._response, faults), default=0) for faults in found], dtype=np.int64)
         self._latched = np.where(response >= Response.REGULATE, np.maximum(self._latched, response), self._latched)
         response = np.maximum(response, self._latched.astype(np.int64))
         lines: list[str | None] = []
-        for reasons, code in zip(found, response, strict=True):
-            texts = [str(reason) for reason in reasons]
+        for faults, code in zip(found, response, strict=True):
+            texts = [fault.line(DONE[self._response(fault)]) for fault in faults]
             if not texts and code >= Response.REGULATE:
                 texts = [f"{DONE[Response(code)]} earlier in this run"]
             lines.append(" | ".join(texts) or None)
-        kinds = tuple(tuple(reason.kind for reason in reasons) for reasons in found)
         rate = np.where(response == Response.PASS, allowed, 0.0)
         self.budget.grant(rate)
-        return Ruling(rate, response, lines, kinds, self._heat.off, setpoint)
+        return Ruling(rate, response, lines, tuple(map(tuple, found)), self._heat.off, setpoint)
+
+    def _response(self, fault: Fault) -> Response:
+        """Return the response to a fault; a pause has gone through that of its fault, and only holds."""
+        return Response.HOLD if isinstance(fault, PAUSES) else self.config.response(fault)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
         """Book what was dosed; without a waste pump in the model the level stays at its tube.
@@ -205,7 +206,7 @@ class Interlock:
         """Go on with a bottle that holds so much now: what an empty one has led to is over."""
         self.budget.bottle_ml[row] = self.budget.fed_ml[row] + bottle_ml
         self._change.refilled(row)
-        if list(REMEDIES)[int(self._hold_kind[row])] == "no_dilution":
+        if self._hold_kind[row] == PAUSES.index(messages.NoDilutionPause):
             self._hold_until_s[row] = -math.inf
 
     def latch(self, response: Response, rows: Mask) -> None:
@@ -225,21 +226,9 @@ class Interlock:
             raise ValueError(f"interlock: its saved state has other fields: {', '.join(sorted(other))[:80]}")
         for part in (*self._parts, self):
             memory.restore(part, state, "interlock")
-        for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
+        for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(PAUSES)))):
             if not np.isin(getattr(self, key), np.array(codes)).all():
                 raise ValueError(f"interlock.{key}: {state[key]}, no such code")
-
-
-@dataclass(frozen=True)
-class _Reason:
-    """Why one reactor is responded to: which kind, how, and what was seen."""
-
-    kind: str
-    response: Response
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.text}; {DONE[self.response]}; {REMEDIES.get(self.kind, '')}".rstrip("; ")
 
 
 def kinds_of(text: str) -> list[str]:

@@ -1,12 +1,14 @@
 """Checks of single samples: in time, possible for a working sensor, not too hot."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from hardware.messages import Fault
 from hardware.reactor import Array, Mask, Measurement
+from hardware.safety import messages
 from hardware.safety.config import RAW_MAX, RAW_MIN, SafetyConfig
 
 __all__ = ["Finding", "Heat", "Readings"]
@@ -20,16 +22,20 @@ MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples
 class Finding:
     """Something is wrong with some reactors.
 
-    kind: the reason, of `RESPONSES`.
+    fault: what.
     rows: the reactors concerned, shape (N,).
-    text: what was seen, for a reactor's index.
-    cool: reactors that get no dose for a while after this, unless the reason is only reported; None for none.
+    seen: the values of the fault's sentence, one for all or of shape (N,).
+    cool: reactors that get no dose for a while after this, unless the fault is only reported; None for none.
     """
 
-    kind: str
+    fault: type[Fault]
     rows: Mask
-    text: Callable[[int], str]
+    seen: dict[str, Any]
     cool: Mask | None = None
+
+    def of(self, n: int) -> Fault:
+        """Say it of reactor n."""
+        return self.fault(**{k: float(v[n]) if isinstance(v, np.ndarray) else v for k, v in self.seen.items()})
 
 
 class Readings:
@@ -49,13 +55,13 @@ class Readings:
     def check(self, m: Measurement, fresh: Mask, now: float) -> tuple[Mask, list[Finding]]:
         """Find the fresh rows whose reading may be used, and what is wrong with the others."""
         findings = self._ages(m, fresh, now)
-        od, raw = m.od, self._raw(m)
+        c, od, raw = self._config, m.od, self._raw(m)
         believed, broken, impossible, frozen, repeats = self._judge(m, fresh)
         self._seen, self._repeats = np.where(fresh, od, self._seen), repeats
         findings += [
-            Finding("spectrometer", broken, lambda i: f"OD {od[i]:.2f}, raw {raw[i]:.0f}: the light sensor failed"),
-            Finding("impossible", impossible, lambda i: f"OD {od[i]:.3f}, raw {raw[i]:.0f}: outside what can be"),
-            Finding("frozen", frozen, lambda i: f"OD exactly {od[i]:.6f} in {repeats[i] + 1:.0f} samples"),
+            Finding(messages.SpectrometerFault, broken, {"od": od, "raw": raw}),
+            Finding(messages.ImpossibleFault, impossible, {"od": od, "raw": raw, "low": c.od_min, "high": c.od_max}),
+            Finding(messages.FrozenFault, frozen, {"od": od, "samples": repeats + 1.0}),
         ]
         return believed, findings
 
@@ -87,8 +93,8 @@ class Readings:
         silent = age > 60.0 * self._config.silent
         lost = (age > self._lost_s) & ~silent
         stale = (age > self._stale_s) & ~lost & ~silent
-        rows = {"stale": stale, "lost": lost, "silent": silent}
-        return [Finding(kind, mask, lambda i: f"no new sample for {age[i]:.0f} s") for kind, mask in rows.items()]
+        rows = {messages.StaleFault: stale, messages.LostFault: lost, messages.SilentFault: silent}
+        return [Finding(fault, mask, {"age_s": age}) for fault, mask in rows.items()]
 
     def resumed(self) -> None:
         """Restart the age of the newest sample.
@@ -139,8 +145,8 @@ class Heat:
         blind = asked & (self._nonsense >= 3)
         self._heat_off = np.where(trip | blind, 1.0, self._heat_off)
         return [
-            Finding("hot", trip, lambda i: f"{temperature[i]:.1f} degC, target {target[i]:.1f}: heating off"),
-            Finding("thermometer", blind, lambda i: f"reads {reading_c[i]:.1f} degC: heating off"),
+            Finding(messages.HotFault, trip, {"temperature": temperature, "target": target}),
+            Finding(messages.ThermometerFault, blind, {"temperature": reading_c}),
         ]
 
     def _relieve(self, temperature: Array, target: Array, known: Mask, now: float) -> None:

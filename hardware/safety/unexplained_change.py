@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from hardware.reactor import Array, Mask
+from hardware.safety import messages
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
 
@@ -53,14 +54,12 @@ class UnexplainedChange:
         self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
         first = believed & np.isnan(before)
         usual = believed & ~step & ~first
+        seen = {"before": before, "od": od}
         findings = [
-            Finding("jump", step & ~down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: growth cannot do that"),
-            Finding(
-                "falls", step & down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: no dose explains that",
-                cool=settled & down,
-            ),
+            Finding(messages.JumpFault, step & ~down, seen),
+            Finding(messages.FallsFault, step & down, seen, cool=settled & down),
             *self._accumulate(od, t, usual, setpoint),
-        ]  # fmt: skip
+        ]
         taken = first | usual | settled
         self._excess, self._deficit = (np.where(settled, 0.0, s) for s in (self._excess, self._deficit))
         self._suspects = np.where(settled, 0, suspects)
@@ -134,20 +133,9 @@ class UnexplainedChange:
         self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
         self._futile = np.where((futile_now & short) | rising, 0.0, futile)
         return [
-            Finding(
-                "no_dilution",
-                rising,
-                lambda i: f"ln OD is {excess[i]:.2f} too high: of {doubt_ml[i]:.1f} mL some or all was air",
-                rising,
-            ),
-            Finding(
-                "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain", falling
-            ),
-            Finding(
-                "cannot_hold",
-                helpless & np.isfinite(od),
-                lambda i: f"full feed does not bring OD down to {setpoint[i]:g}",
-            ),
+            Finding(messages.NoDilutionFault, rising, {"above": excess, "doubt_ml": doubt_ml}, rising),
+            Finding(messages.SlowFallFault, falling, {"below": deficit}, falling),
+            Finding(messages.CannotHoldFault, helpless & np.isfinite(od), {"setpoint": setpoint}),
         ]
 
     def _lasting(self, begins: Mask, od: Array, usual: Mask, short: Mask, limit: Array) -> Mask:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 from hardware.errors import RecordingError
-from hardware.storage.journal import REMEDY
+from hardware.storage.messages import RowDamaged
 
 __all__ = ["REPEAT_S", "Dosed", "Ending", "Given", "damaged", "dosed", "feeds_by"]
 
@@ -172,4 +172,4 @@ def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
 def damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
     """Build the error of a row that is not as a driver writes it."""
     what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
-    return RecordingError(f"journal.jsonl: {what}; {REMEDY}")
+    return RowDamaged(path="journal.jsonl", what=what)

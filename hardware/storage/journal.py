@@ -12,12 +12,12 @@ from typing import Any
 
 from hardware.clock import uptime
 from hardware.errors import RecordingError
+from hardware.storage import messages
 from hardware.storage.atomic import sync_folder
 
-__all__ = ["REMEDY", "Journal", "plain", "read_journal"]
+__all__ = ["Journal", "plain", "read_journal"]
 
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
-REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
     f'"kind":"{kind}"'.encode()
@@ -123,10 +123,9 @@ class Journal:
             sync_folder(path.parent)
         except OSError as error:
             self.close()
-            why = f"{error.strerror or error}; check folder, rights and disk"
             if isinstance(error, BlockingIOError):
-                why = "the run is under way in another program; end that first"
-            raise RecordingError(f"journal {path}: {why}") from error
+                raise messages.JournalTaken(path=path) from error
+            raise messages.NotOpened(path=path, why=error.strerror or error) from error
         try:
             self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
             _check(self.rows, path)
@@ -139,7 +138,7 @@ class Journal:
     def append(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
         if self._file is None:
-            raise RecordingError(f"journal {self.path}: written to after it was closed")
+            raise messages.NotWritten(path=self.path, why="written to after it was closed")
         self._count_interrupted()
         row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(uptime(), 3), "kind": kind}
         line = json.dumps(plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
@@ -153,8 +152,7 @@ class Journal:
             if self._fsync:
                 os.fsync(self._file)
         except OSError as error:
-            remedy = "free disk space, then resume the run"
-            raise RecordingError(f"journal {self.path}: {error.strerror or error}; {remedy}") from error
+            raise messages.NotWritten(path=self.path, why=error.strerror or error) from error
 
     def _count_interrupted(self) -> None:
         """Count a row that a stop interrupted after its write; cut what was written of one in part."""
@@ -172,7 +170,7 @@ class Journal:
         try:
             newest = _tail(self.path, max(self.path.stat().st_size - TAIL, 0))
         except OSError as error:
-            raise RecordingError(f"journal {self.path}: {error.strerror or error}; check folder and disk") from error
+            raise messages.NotOpened(path=self.path, why=error.strerror or error) from error
         return list(_parse(newest, self.path))
 
     def close(self) -> None:
@@ -187,9 +185,9 @@ def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
         try:
             row = json.loads(line)
         except ValueError as error:
-            raise RecordingError(f"journal {path}, line {number}: {error}; {REMEDY}") from error
+            raise messages.RowDamaged(path=path, what=f"line {number}: {error}") from error
         if not isinstance(row, dict):
-            raise RecordingError(f"journal {path}, line {number}: not a row; {REMEDY}")
+            raise messages.RowDamaged(path=path, what=f"line {number}: not a row")
         yield row
 
 
@@ -200,7 +198,7 @@ def _check(rows: list[dict[str, Any]], path: Path) -> None:
         wrong = [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]
         if wrong or not math.isfinite(row["wall"]):
             wrong = wrong or ["wall"]
-            raise RecordingError(f"journal {path}: a row without a usable {wrong[0]} ({str(row)[:60]}); {REMEDY}")
+            raise messages.RowDamaged(path=path, what=f"a row without a usable {wrong[0]} ({str(row)[:60]})")
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
@@ -211,6 +209,6 @@ def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise RecordingError(f"journal {path}: {error.strerror or error}; give the folder of a run") from error
+        raise messages.NotOpened(path=path, why=error.strerror or error) from error
     kept = _complete(data)
     return list(_parse(data[:kept], path)), len(data) - kept

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from hardware.errors import RecordingError
+from hardware.storage.messages import MarksDamaged
 from hardware.storage.recorder import Recorder
 
 __all__ = ["NAME", "Mark", "add_mark", "read_marks"]
@@ -81,4 +81,4 @@ def read_marks(folder: Path) -> list[Mark]:
             raise ValueError(f"share {wrong[0].share:g} at minute {wrong[0].time_min:g} has no sd above 0")
         return found
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RecordingError(f"{path}: damaged ({type(error).__name__}: {error}); mend it or move it away") from None
+        raise MarksDamaged(path=path, why=f"{type(error).__name__}: {error}") from None

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from hardware.errors import RecordingError
 from hardware.storage.atomic import sync_folder
+from hardware.storage.messages import NotOpened, NotRecording, NotWritten, TornLine, WrongRow
 
 __all__ = ["Recorder"]
 
@@ -38,14 +38,14 @@ class Recorder(AbstractContextManager["Recorder"]):
     ) -> None:
         self.path = Path(path)
         self.columns = tuple(columns)
-        self.repaired: str | None = None
+        self.repaired: TornLine | None = None
         self._fsync, self._remedy = fsync, remedy
         if not self.columns or len(set(self.columns)) != len(self.columns):
             raise ValueError(f"columns {self.columns}: allowed are unique names, at least one")
         try:
             self._fd = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be opened for writing: {error.strerror}") from None
+            raise NotOpened(path=self.path, why=error.strerror) from None
         try:
             self._continue_or_begin()
         except BaseException:
@@ -62,7 +62,7 @@ class Recorder(AbstractContextManager["Recorder"]):
         if row.keys() != set(self.columns):
             missing = [c for c in self.columns if c not in row]
             unknown = [c for c in row if c not in self.columns]
-            raise RecordingError(f"{self.path}: row lacks columns {missing} and has unknown columns {unknown}")
+            raise WrongRow(path=self.path, missing=missing, unknown=unknown)
         self._append(_csv_line([_cell(row[c]) for c in self.columns]))
 
     def amend(self, row: Mapping[str, Value]) -> None:
@@ -91,32 +91,30 @@ class Recorder(AbstractContextManager["Recorder"]):
         whole = content[: content.rfind(b"\n") + 1]
         if torn := content[len(whole) :]:
             if not whole and not header.startswith(torn):
-                raise RecordingError(f"{self.path}: exists and is not a recording; {self._remedy}")
+                raise NotRecording(path=self.path, why="exists and is not a recording", help=self._remedy)
             os.ftruncate(self._fd, len(whole))
-            self.repaired = f"{self.path}: cut a torn last line of {len(torn)} bytes"
+            self.repaired = TornLine(path=self.path, length=len(torn))
         if not whole:
             self._append(header)
             if self._fsync:
                 sync_folder(self.path.parent)
         elif (found := whole[: whole.index(b"\n") + 1]) != header:
-            raise RecordingError(
-                f"{self.path}: has the header {found.decode(errors='replace').strip()!r}, "
-                f"expected {header.decode().strip()!r}; {self._remedy}"
-            )
+            why = f"has the header {found.decode(errors='replace').strip()!r}, expected {header.decode().strip()!r}"
+            raise NotRecording(path=self.path, why=why, help=self._remedy)
 
     def _append(self, line: bytes) -> None:
         if self._fd < 0:
-            raise RecordingError(f"{self.path}: is closed")
+            raise NotWritten(path=self.path, why="is closed")
         try:
             before = os.fstat(self._fd).st_size
             written = os.write(self._fd, line)
             if written != len(line):
                 os.ftruncate(self._fd, before)
-                raise RecordingError(f"{self.path}: only {written} of {len(line)} bytes written; is the disk full?")
+                raise NotWritten(path=self.path, why=f"only {written} of {len(line)} bytes written")
             if self._fsync:
                 os.fsync(self._fd)
         except OSError as error:
-            raise RecordingError(f"{self.path}: row not written: {error.strerror}") from None
+            raise NotWritten(path=self.path, why=error.strerror) from None
 
 
 def _cell(value: Value) -> str:

@@ -10,18 +10,20 @@ from typing import Any
 
 import numpy as np
 
+from hardware.chibio.messages import WrongStatus
 from hardware.chibio.protocol import FEED, DeviceState, parse_state
 from hardware.clock import Clock
-from hardware.errors import ProtocolError, ReactorError
+from hardware.errors import ReactorError
 from hardware.link.transport import Reply
-from hardware.reactor import Fault, Measurement, Vitals
+from hardware.messages import Fault
+from hardware.reactor import Measurement, Vitals
+from hardware.watch import messages
 from hardware.watched import Watched
 
 __all__ = ["WatchedChiBio"]
 
 AGAIN_S = 20.0  # from one `measure` without a sample to the next
 CYCLE_S = 56.0  # sooner no sample follows another
-SELECT = "open this reactor in the device's web page, and leave the page there"
 
 
 class WatchedChiBio(Watched):
@@ -50,7 +52,7 @@ class WatchedChiBio(Watched):
             try:
                 fresh, fault = self._look()
             except ReactorError as error:
-                fault = Fault("link", str(error), "check cable, address and that the server runs; it is asked again")
+                fault = messages.NotHeardOf(error=error)
         at, od, warm, raw, blank = self._newest[:, None]
         age = np.full(1, self._clock.now() - self._arrived_s)
         return Measurement(at, od, warm, np.full(1, fresh), Vitals(age, raw, (fault,), blank))
@@ -59,15 +61,15 @@ class WatchedChiBio(Watched):
         """Whether a new sample came, and what is wrong. Raises: ReactorError."""
         reply = self._get("/getSysdata/")
         if reply.status != 200:
-            raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
+            raise WrongStatus(request="GET /getSysdata/", status=reply.status, expected=200)
         state, (name,) = parse_state(reply.body), self.names
         if state.selected != name:
-            return False, Fault("selection", f"the device shows {state.selected}, not {name}", SELECT)
+            return False, messages.OtherShown(shown=state.selected, reactor=name)
         if self._device_id not in ("", state.device_id):
-            return False, Fault("identity", f"another unit answers, {state.device_id}", "start a new run")
+            return False, messages.OtherUnit(unit=state.device_id)
         self._device_id = state.device_id
         if not state.running:
-            return False, Fault("stopped", "its experiment does not run", "start it in the device's web page")
+            return False, messages.NotRunning()
         if not math.isfinite(state.sample_s) or state.sample_s == self._sample_s:
             return False, None
         if not math.isnan(self._sample_s):

@@ -8,7 +8,8 @@ from hardware.errors import LinkError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import ALT, MEDIA, Cluster, Mailbox
 from hardware.pioreactor.sampling import UnitSampling
-from hardware.reactor import Fault, Measurement, Vitals
+from hardware.reactor import Measurement, Vitals
+from hardware.watch.messages import NoReading
 from hardware.watched import Watched
 
 __all__ = ["WatchedPioreactors"]
@@ -51,9 +52,7 @@ class WatchedPioreactors(Watched):
         warm = np.array([box.temperature for box in self.boxes.values()])
         age = np.array([now - one.arrived_s for one in s])
         faults = tuple(
-            Fault("stalled", f"no reading for {now - one.read_s:.0f} s", "look whether its OD reading runs")
-            if now - one.read_s > SILENT_S * self._config.speed
-            else None
+            NoReading(seconds=now - one.read_s) if now - one.read_s > SILENT_S * self._config.speed else None
             for one in s
         )
         return Measurement(at - self._began_s, od, warm, np.array(fresh), Vitals(age, raw, faults))

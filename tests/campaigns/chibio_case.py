@@ -9,7 +9,7 @@ import numpy as np
 from experiments.control.config import DeployConfig
 from experiments.laws.base import Array
 from experiments.loop.loop import Step
-from experiments.loop.signals import FILTER_ALARM
+from experiments.loop.messages import FilterAlarm
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from hardware.errors import ReactorError
@@ -86,7 +86,7 @@ class _Watch:
             mine = name == FAULTY or (self.fault is not None and self.fault.wide)
             for reason in (step.reasons[n] or "").split(" | "):
                 kind = reason.split(":")[0]
-                if kind in ("", FILTER_ALARM):  # ordinary noise raises that one several times a day; nobody is told
+                if kind in ("", FilterAlarm.kind):  # ordinary noise raises that one several times a day; nobody is told
                     continue
                 if not struck:
                     self.result.early_alarms += 1

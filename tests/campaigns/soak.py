@@ -19,7 +19,7 @@ from experiments.cli import files, frame
 from experiments.laws.base import Mask
 from experiments.laws.registry import on_device
 from experiments.loop.loop import Step
-from experiments.loop.signals import FILTER_ALARM
+from experiments.loop.messages import FilterAlarm
 from hardware.chibio.protocol import POSITIONS
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
@@ -114,7 +114,7 @@ class _Meter:
     def step(self, step: Step, settled: Mask) -> None:
         """Take a pass of the loop. Args: settled: reactors whose phase is so old that they must be at its setpoint."""
         self.samples += int(step.rows.sum())
-        self.alarms += sum(bool(set(kinds_of(reason or "")) - {FILTER_ALARM}) for reason in step.reasons)
+        self.alarms += sum(bool(set(kinds_of(reason or "")) - {FilterAlarm.kind}) for reason in step.reasons)
         vials = self.r.device.vials.values()
         od = np.array([vial.plant.culture.od[0] for vial in vials], dtype=np.float64)
         for n in np.flatnonzero(step.rows & settled):

@@ -10,12 +10,14 @@ import pytest
 from envs.bench import Bench
 from experiments.control import run
 from experiments.control.assemble import unpack
+from experiments.control.messages import VolumesDiffer
 from experiments.deploy import main
 from experiments.loop.signals import Density
 from hardware.chibio.config import EmulatorConfig
 from hardware.emulator.family import _words
 from hardware.emulator.server import build, parser
 from hardware.storage.journal import read_journal
+from tests.hardware.script import logged
 
 
 def error(folder: Path, *words: str) -> dict[str, float]:
@@ -105,4 +107,4 @@ def test_a_vial_that_differs_is_said_also_of_one_reactor(tmp_path: Path, caplog:
     words = ["backend.reactors=[M0,M1]", "bench.volumes_ml.M1=14", "plant.vessel.volume_ml=20", "controller=pi"]
     with caplog.at_level("INFO"):
         assert np.isfinite(list(error(tmp_path / "run", *words).values())).all()
-    assert "plant.vessel.volume_ml = 20 mL differs from bench.volume_ml = 20 mL or bench.volumes_ml" in caplog.text
+    assert logged(caplog, VolumesDiffer) == [{"other_ml": 20.0, "volume_ml": 20.0}]

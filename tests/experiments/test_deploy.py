@@ -30,8 +30,10 @@ from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
 from experiments.record.curves import Curves
 from experiments.recordings.reader import read_recording
+from hardware.chibio.messages import Absent
 from hardware.errors import DeviceStateError
 from hardware.family import family_of
+from hardware.messages import PumpsNotOff
 from hardware.reactor import Command
 from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
@@ -383,7 +385,8 @@ def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_s
     assert loop.gone.tolist() == [False, True]
     assert any("absent" in reason for reason in reasons)
     assert any("silent" in reason for reason in reasons)
-    with pytest.raises(DeviceStateError, match=r"pumps not verified off: M1: .*absent.*by hand"):
+    with pytest.raises(PumpsNotOff) as error:
         lab.reactors.stop()
+    assert error.value.fields == {"failed": f"M1: {Absent(reactor='M1', present='M0')}"}
     assert lab.motors_off()
     assert lab.device.supervisor.exits == 1

@@ -21,6 +21,7 @@ from experiments.coculture.base import SHARE
 from experiments.coculture.signal import Share, ShareWarnings
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
+from experiments.control.messages import CannotResume, PlantIgnored
 from experiments.deploy import main
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
@@ -30,6 +31,7 @@ from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 from tests.hardware.driver_lab import DriverLab
+from tests.hardware.script import logged
 
 pytestmark = pytest.mark.numeric
 
@@ -223,16 +225,15 @@ def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_
 
 
 def test_what_a_backend_does_not_take_over_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    line = "plant: backend=chibio has vials of its own, plant.* changes nothing there"
     usual = build(PlantConfig(), presets.load("plant/nominal_noise"), "plant")
-    for plant, said in ((usual, []), (PlantConfig(), []), (PlantConfig(start_od=0.3), [line])):
+    for plant, said in ((usual, []), (PlantConfig(), []), (PlantConfig(start_od=0.3), [{"backend": "chibio"}])):
         caplog.clear()
         assemble.unpack(replace(DEVICE, plant=plant), tmp_path)
-        assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == said
+        assert logged(caplog, PlantIgnored) == said
     caplog.clear()
     assemble.unpack(replace(TWO, plant=PlantConfig(start_od=0.3)), tmp_path)
     assert caplog.text == ""
-    with pytest.raises(frame.UserError, match=r"^resume=RUN: a simulated run takes a second; run it again$"):
+    with pytest.raises(CannotResume):
         assemble.unpack(replace(TWO, resume="RUN"), tmp_path)
     assert assemble.unpack(replace(DEVICE, resume="RUN"), tmp_path).resumed
 

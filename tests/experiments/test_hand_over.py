@@ -9,6 +9,7 @@ import pytest
 from envs.scenario import Scenario
 from experiments.control import run as control
 from experiments.laws.base import Array, Controller, Mask
+from hardware.chibio.messages import HandOverFailed, NotTakenOver
 from hardware.emulator.faults import inject
 from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
@@ -146,8 +147,8 @@ def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_aga
     run.begin()
     run.live(3)
     fault = run.reactors.stations[0].book.fault
-    assert fault is not None
-    assert "not taken over: M0: on-board OD regulation is off, target 0.5 after" in str(fault)
+    assert isinstance(fault, NotTakenOver)
+    assert isinstance(fault.fields["error"], HandOverFailed)
     assert not run.data()["OD"]["ON"]
     monkeypatch.undo()
     run.live(3)

@@ -6,13 +6,15 @@ from typing import Any
 import pytest
 
 from experiments.control import run as control
+from experiments.record.messages import RecordingGone, RecordingUnreadable
 from experiments.record.record import Record
 from experiments.record.recovery import Rows, at_end
 from experiments.record.summary import ChangeLog
 from hardware.emulator.faults import inject
-from hardware.errors import RecordingError
 from hardware.storage.doses import Ending
+from hardware.storage.messages import JournalTaken
 from tests.experiments.test_open_dose import in_a_dose
+from tests.hardware.script import logged
 
 
 def test_what_was_repeated_after_the_last_row_is_in_it_and_once_however_often_the_run_goes_on(tmp_path: Path) -> None:
@@ -56,7 +58,7 @@ def test_a_run_that_is_under_way_is_left_as_it_is(tmp_path: Path) -> None:
     with open(record.journal.path, "ab") as f:
         f.write(b'{"n":1,"ha')  # just being written
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    with pytest.raises(RecordingError, match="under way"):
+    with pytest.raises(JournalTaken):
         Record(tmp_path, ("M0",), fsync=False)
     assert {path: path.read_bytes() for path in before} == before
     record.close()
@@ -71,10 +73,10 @@ def test_a_recording_that_is_deleted_in_a_run_is_told_with_the_next_row_and_at_i
     path.unlink() if how == "deleted" else path.rename(tmp_path / "elsewhere")
     for _ in run.run(run.clock.now() + 150.0):
         pass
-    assert caplog.text.count(f"{path}: deleted or moved in the run") == 1
+    assert logged(caplog, RecordingGone) == [{"path": path}]
     run.reactors.stop()
     rows = len(run.record.rows[0])
-    with pytest.raises(RecordingError, match=r"M0\.csv: No such file or directory; resume the run"):
+    with pytest.raises(RecordingUnreadable):
         run.record.complete()
     assert len(run.record.rows[0]) == rows  # for figure and summary
     run.close()

@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import frame
-from experiments.control import notify
+from experiments.control import messages, notify
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Hook, Notifier, hidden
 from tests import programs
+from tests.hardware.script import logged
 from tests.patience import PATIENCE_S
 
 SECRET = "T0SECRET"
@@ -106,7 +107,7 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path,
         tell("alarm", "more")
     assert tell.dropped == 5
     tell.close()  # comes back although the hook does not
-    assert "5 were dropped" in caplog.text
+    assert logged(caplog, messages.HookTally)[0]["dropped"] == 5
     assert SECRET not in caplog.text
     server.released.set()
 
@@ -140,8 +141,9 @@ def test_every_message_comes_in_order_and_what_was_not_taken_is_counted_and_said
     assert [(m["event"], m["text"], m.get("reactor", "")) for m in hook.lines] == told
     assert {m["run"] for m in hook.lines} == {str(tmp_path)}
     assert (tell.sent, tell.failed, tell.dropped) == (3, 2, 0)
-    assert caplog.text.count("counting did not take a message (status 500); the run goes on") == 1
-    assert caplog.text.count("notify: counting took 3 messages; 2 failed, 0 were dropped, 0 were left at the end") == 1
+    assert logged(caplog, messages.HookFailed) == [{"hook": "counting", "why": "status 500"}]
+    tally = {"hook": "counting", "sent": 3, "failed": 2, "dropped": 0, "left": 0}
+    assert logged(caplog, messages.HookTally) == [tally]
 
 
 def test_a_hook_of_the_environment_is_used_and_one_that_is_wrong_stops_no_run_that_is_resumed(
@@ -159,17 +161,17 @@ def test_a_hook_of_the_environment_is_used_and_one_that_is_wrong_stops_no_run_th
     assert (tell._hook.name, tell._hook._target) == ("https://host/…", "https://host/T0")
     tell.close()
     monkeypatch.setenv("MY_HOOK", "  ")
-    with pytest.raises(frame.UserError, match="notify=env:MY_HOOK: the environment has no MY_HOOK; set it to"):
+    with pytest.raises(messages.NotSet):
         notify.opened("env:MY_HOOK", tmp_path, resumed=False)
     notify.opened("env:MY_HOOK", tmp_path, resumed=True)("end", "nobody is told")
-    assert "the environment has no MY_HOOK; set it to a command or an address, then resume again" in caplog.text
-    with pytest.raises(frame.UserError, match="notify: there is no such command"):
+    assert len(logged(caplog, messages.HookUnusable)) == 1
+    with pytest.raises(messages.NoCommand):
         notify.opened("env:OTHER_HOOK", tmp_path, resumed=False)
     caplog.clear()
     nobody = notify.opened("env:OTHER_HOOK", tmp_path, resumed=True)
     nobody("end", "nobody is told")
     assert nobody._hook is None
-    assert "there is no such command; allowed a command, https://... or env:NAME; mend it, then resume" in caplog.text
+    assert len(logged(caplog, messages.HookUnusable)) == 1
     assert notify.opened("", tmp_path, resumed=False)._hook is None
     for wrong, why in (
         ("cat 'open", r"the command cannot be read \(No closing"),

@@ -12,8 +12,9 @@ import pytest
 
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
+from hardware.chibio.messages import WrongStatus
 from hardware.emulator.process import EmulatorProcess
-from hardware.errors import DeviceStateError, ProtocolError
+from hardware.errors import DeviceStateError
 from tests.programs import Program, run
 
 
@@ -45,9 +46,9 @@ def test_a_server_that_is_another_one_is_told_by_its_address() -> None:
     with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as other:  # which answers 501 to every GET
         threading.Thread(target=other.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{other.server_port}"
-        said = f"^{url}: GET /getSysdata/: status 501, expected 200; check the address$"
-        with pytest.raises(ProtocolError, match=said), linked(ChiBioConfig(url=url)):
+        with pytest.raises(WrongStatus) as error, linked(ChiBioConfig(url=url)):
             pass
+        assert error.value.fields == {"request": f"{url}: GET /getSysdata/", "status": 501, "expected": 200}
         other.shutdown()
 
 

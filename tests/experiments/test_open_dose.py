@@ -6,20 +6,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf.messages import Message
 from envs.scenario import Scenario
 from experiments.laws.base import Array, Mask
 from experiments.loop.loop import Step
 from experiments.record.record import Record
+from hardware.chibio import messages
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import LinkError
 from hardware.link.transport import SwitchedOff
+from hardware.messages import OpenDose
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Rehearsal, StandIn, rehearsed
 from tests.hardware.emulator_lab import quiet
+from tests.hardware.script import noted
 
 FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"
-TARGET, NONE = "/SetOutputTarget/Pump1/M0/", "a dose of 1.20 mL gave no medium"
+TARGET = "/SetOutputTarget/Pump1/M0/"
 
 
 class Greedy(StandIn):
@@ -60,11 +64,11 @@ class Cut(Full):
     def journal(self, kind: str) -> list[dict[str, Any]]:
         return [row for row in read_journal(self.folder / "journal.jsonl")[0] if row["kind"] == kind]
 
-    def note(self) -> str:
-        """What was said of the dose that was left open, which is said once."""
-        notes = [str(row["note"]) for row in self.journal("note")]
-        (at,) = [k for k, note in enumerate(notes) if "left open" in note]
-        return "; ".join(note for note in notes[at:] if "dose" in note)
+    def noted(self, *kinds: type[Message]) -> list[dict[str, Any]]:
+        """The values of these messages since the dose that was left open was told of, which is done once."""
+        notes = self.journal("note")
+        (at,) = [k for k, note in enumerate(notes) if note["name"] == "OpenDose"]
+        return noted(notes[at:], *kinds)
 
     def off_by_ml(self) -> float:
         """What is booked beyond what really flowed, after the last dose has."""
@@ -94,8 +98,8 @@ def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobod
     assert "budget" not in reasons(steps)
     assert steps[0].rate[0] == 0.02  # dosed with the very first sample
     times = 900 // 63
-    assert f"repeated up to {times} times by the device" in run.note()  # its command had not been answered
-    assert f"to {1.2 * (times + 1):.2f} mL in all" in run.note()
+    [told] = run.noted(messages.DoseRepeated)  # its command had not been answered
+    assert (told["times"], told["most_ml"]) == (times, pytest.approx(1.2 * (times + 1), abs=0.005))
     assert abs(run.off_by_ml()) < 0.1 * times  # a single dose varies
     (end,) = [row for row in run.journal("dose_end") if row["feed_times"]]
     assert end["repeated_ml"] == pytest.approx(1.2 * times, rel=1e-3)
@@ -129,7 +133,7 @@ def test_they_are_booked_once_and_stand_in_one_row_however_often_the_program_die
     assert budget.volume_ml[0] < 20.0 + 1.3
     assert budget._hour[0].max() < 2.5  # each in the minute in which it was given
     assert abs(run.off_by_ml()) < 1.0
-    assert "left open" in "".join(str(row["note"]) for row in run.journal("note"))
+    assert noted(run.journal("note"), OpenDose)
     assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(budget.fed_ml[0]))
 
 
@@ -146,7 +150,7 @@ def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_kno
     true = [d.seconds for d in run.device.vials["M0"].doses if d.pump == "Pump1" and d.start_s > run.died_s - 5.0]
     ended = len(run.journal("dose_end"))
     run.resumed()
-    assert "the device was restarted in a dose" in run.note()
+    assert run.noted(messages.RestartedInDose)
     end = run.journal("dose_end")[ended]
     assert len(true) == 1 + after_s // 63.0
     more_ml = 0.05 * len(true)  # each dose by itself
@@ -155,15 +159,15 @@ def test_a_device_that_was_restarted_repeated_the_dose_until_then_and_nobody_kno
 
 
 @pytest.mark.parametrize(
-    ("request_", "note", "waste_times"), [(FEED_OFF, "", [14]), (TARGET, NONE, []), (WASTE_ON, NONE, [14])]
+    ("request_", "none", "waste_times"), [(FEED_OFF, False, [14]), (TARGET, True, []), (WASTE_ON, True, [14])]
 )
-def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(tmp_path, request_, note, waste_times):
+def test_killed_while_the_feed_pump_does_not_run_no_medium_followed(tmp_path, request_, none, waste_times):
     """In the waste tail, or before the feed pump was started."""
     run = Cut(tmp_path, request_)
     run.wait(900.0)
     run.resumed()
-    assert note in run.note()
-    assert "repeated" not in run.note()
+    assert len(run.noted(messages.DoseGaveNothing)) == none
+    assert not run.noted(messages.DoseRepeated)
     assert abs(run.off_by_ml()) < 1.0
     assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
     assert [row["waste_times"] for row in run.journal("dose_end") if row["waste_times"]] == waste_times
@@ -179,7 +183,7 @@ def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(tmp_p
     assert (0.0 < end["feed_ml"] < 1.0) is fed  # cut short: 1.2 mL were planned
     run.wait(900.0)
     run.resumed()
-    assert not [row for row in run.journal("note") if "left open" in row["note"]]
+    assert not noted(run.journal("note"), OpenDose)
     rows = run.record.series("volume_ml")[0]
     assert end["feed_ml"] in rows
     assert abs(run.off_by_ml()) < 1.0
@@ -228,8 +232,8 @@ def test_repeats_before_a_board_agent_ended_them_are_booked(tmp_path, monkeypatc
     assert run.truth("M0")["feed_ml"] == pytest.approx(before, abs=0.01)
     run.resumed()
     if answers:
-        assert "the board agent switched off in a dose: Pump1, Pump2" in run.note()
+        assert run.noted(messages.AgentSwitchedOff) == [{"pumps": "Pump1, Pump2"}]
         assert abs(run.off_by_ml()) < 0.9  # eight doses vary, one more or less would be 1.2
     else:
-        assert "repeated up to 2 times by the device" in run.note()
+        assert [told["times"] for told in run.noted(messages.DoseRepeated)] == [2]
         assert -0.6 < run.off_by_ml() < 1.8  # every repetition, and at most one that the agent was quicker than

@@ -21,6 +21,7 @@ from experiments.coculture.policies import KEPT as COMPOSITION_POLICY
 from experiments.coculture.policies import composition_policy
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
+from experiments.control.messages import OtherPeriod, PumpsTooMuch
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
@@ -115,12 +116,12 @@ def test_a_policy_that_pumps_faster_than_the_bench_allows_is_refused_with_both_r
     """It was trained for 0.02 mL/s; one of shares of the bench's own largest rate runs on any."""
     policy.save(tmp_path / "policy.npz", laws.law())
     assert load_policy(str(tmp_path), 1.0, 0.02).actions.max() == 0.02  # of the folder that holds it
-    with pytest.raises(UserError, match=r"policy\.npz pumps up to 0\.02 mL/s, the interlock allows 0\.019 mL/s; train"):
+    with pytest.raises(PumpsTooMuch) as fast:
         load_policy(str(tmp_path), 1.0, 0.019)
-    with pytest.raises(
-        UserError, match=r"a control period of 1\.0 min, the backend has 0\.5 min; .*env\.control_min=0\.5"
-    ):
+    assert (fast.value.fields["own"], fast.value.fields["most"]) == (0.02, 0.019)
+    with pytest.raises(OtherPeriod) as slow:
         load_policy(str(tmp_path), 0.5, 0.02)
+    assert (slow.value.fields["own_min"], slow.value.fields["asked_min"]) == (1.0, 0.5)
     assert load_policy("shipped", 0.5, 0.001).actions.max() == 1.0
 
 

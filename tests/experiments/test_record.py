@@ -16,12 +16,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from envs.scenario import Scenario
 from experiments.loop.loop import Step
 from experiments.loop.progress import Progress
-from experiments.record import summary
+from experiments.record import messages, summary
 from experiments.record.curves import Curves, _results, _table
 from experiments.record.record import Record, Recordings
 from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, load_state
 from experiments.reporting import charts
-from hardware.errors import RecordingError
 from hardware.storage.doses import Ending
 from hardware.storage.journal import Journal
 from hardware.storage.marks import Mark, add_mark
@@ -102,7 +101,7 @@ def test_state_that_cannot_be_written_ends_the_run_with_the_remedy(tmp_path: Pat
     with pytest.raises(OSError, match="state.json"):
         record.save({})
     record.close()
-    with pytest.raises(RecordingError, match="no state to resume from"):
+    with pytest.raises(messages.NoState):
         load_state(tmp_path / "recordings" / "state.json")
 
 
@@ -230,32 +229,29 @@ def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own
         reactors.handed_over[0] = True
         done = {"phase": [0, 1], "setpoint": [0.5, 0.6], "done": np.array([True, True])}
         changes(step(70.0, od=[0.5, 0.65], notes=("M0: drained 5 s",), **done))
-    again = "(noted here once an hour, every time in the journal)"
+    doubtful, sure = messages.SupervisorActs(minute=2.0), messages.PolicyActs(minute=3.0)
     assert [record.getMessage() for record in caplog.records] == [
-        "M0: setpoint 0.5 from minute 0, OD 0.500",
-        "M1: recovery from minute 0, OD 0.300",
-        "M1: setpoint 0.8 from minute 1, OD 0.750",
-        f"M0: drained 3 s {again}",
-        "M1: the supervisor's law acts, the estimate is in doubt, from minute 2",
-        "M1: step 1 ended after 3 min: od >= 0.9 at OD 0.910",
-        "M1: window ends at minute 3, mean error 0.0500 OD",
-        "M1: setpoint 0.6 from minute 3, OD 0.910",
-        "M1: the policy acts again from minute 3",
+        str(messages.PhaseBegins(reactor="M0", what="setpoint 0.5", minute=0.0, od=0.5)),
+        str(messages.PhaseBegins(reactor="M1", what="recovery", minute=0.0, od=0.3)),
+        str(messages.PhaseBegins(reactor="M1", what="setpoint 0.8", minute=1.0, od=0.75)),
+        str(messages.NoteSeen(note="M0: drained 3 s")),
+        str(doubtful.about("M1")),
+        str(messages.StepEnded(reactor="M1", step=1, minutes=3.0, why="od >= 0.9", od=0.91)),
+        str(messages.WindowEnds(reactor="M1", minute=3.0, error=0.05)),
+        str(messages.PhaseBegins(reactor="M1", what="setpoint 0.6", minute=3.0, od=0.91)),
+        str(sure.about("M1")),
         "M1: stale: as before",
-        "M0: window ends at minute 70, mean error 0.0225 OD",
-        "M1: window ends at minute 70, mean error 0.3100 OD",
-        "M1: interlock: all well again",
-        f"M0: drained 5 s {again}",
+        str(messages.WindowEnds(reactor="M0", minute=70.0, error=0.0225)),
+        str(messages.WindowEnds(reactor="M1", minute=70.0, error=0.31)),
+        f"M1: {messages.WellAgain()}",
+        str(messages.NoteSeen(note="M0: drained 5 s")),
     ]
     warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert warned == ["M1: stale: as before", "M1: interlock: all well again"]
+    assert warned == ["M1: stale: as before", f"M1: {messages.WellAgain()}"]
     assert told == [
-        ("hand_over", "the supervisor's law acts, the estimate is in doubt, from minute 2", "M1"),
-        ("hand_over", "the policy acts again from minute 3", "M1"),
-        ("alarm", "stale: as before", "M1"),
-        ("alarm", "interlock: all well again", "M1"),
-        ("hand_over", "the device regulates by itself from now on", "M0"),
-    ]
+        ("hand_over", str(doubtful), "M1"), ("hand_over", str(sure), "M1"), ("alarm", "stale: as before", "M1"),
+        ("alarm", str(messages.WellAgain()), "M1"), ("hand_over", str(messages.LeftToDevice()), "M0"),
+    ]  # fmt: skip
 
 
 def test_what_goes_wrong_without_a_new_sample_is_told_and_a_refusal_lasts_until_the_next_one(caplog):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf.messages import NameTaken
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.coculture.signal import COLUMNS
@@ -58,7 +59,7 @@ def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: py
     [
         (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
         (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
-        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat: allowed one"),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat; allowed one"),
     ],
 )
 def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
@@ -75,16 +76,16 @@ def test_the_columns_of_every_signal_follow_one_another(tmp_path: Path) -> None:
 
 
 def test_names_and_actuators_are_used_once() -> None:
-    with pytest.raises(ValueError, match="signal light: there is one of this name already"):
+    with pytest.raises(NameTaken):
         signals.add("light", light.Light)
-    with pytest.raises(ValueError, match="signal interlock: there is one of this name already"):
+    with pytest.raises(NameTaken):
         signals.add("interlock", light.Light)
     held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
     with pytest.raises(ValueError, match="light and light act by the same thermostat"):
         signals.fitting(held, [THERMOSTAT])
-    with pytest.raises(ValueError, match="agent dqn: there is one of this name already"):
+    with pytest.raises(NameTaken):
         agents.add("dqn", type("Other", (), {}), Any, (), "Nothing.")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="env density: there is one of this name already"):
+    with pytest.raises(NameTaken):
         tasks.add("density", type("Other", (), {}), Any, "Nothing.")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"signals\.dark: .*allowed .*light"):
         signals.made("dark", None, [SCHEDULE])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from conf.messages import Message
 from envs.scenario import Scenario
 from experiments.laws.base import Array, Mask
 from experiments.loop.loop import ClosedLoop, Step
@@ -22,6 +23,7 @@ from hardware.logbook import Log
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 from tests.campaigns.rehearsal import SOUND
+from tests.hardware.script import noted
 
 
 class Spy(Transport):
@@ -133,9 +135,9 @@ class DriverLab:
         while self.clock.now() < end and not self.loop.over:
             self.step()
 
-    def notes(self, words: str) -> list[str]:
-        """What the screen said so far and holds these words."""
-        return [note for step in self.steps for note in step.notes if words in note]
+    def notes(self, *kinds: type[Message]) -> list[dict[str, Any]]:
+        """The values of what was noted so far of these messages, or because of them."""
+        return noted(self.rows, *kinds)
 
     def kinds(self) -> set[str]:
         """Every kind of reason that the interlock gave so far."""

@@ -17,13 +17,14 @@ import pytest
 
 from envs.bench import Bench
 from hardware.clock import VirtualClock
-from hardware.errors import LinkError, ProtocolError, ReactorError
+from hardware.errors import LinkError, ReactorError
 from hardware.pioreactor import reactors
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import UnitHistory, replay
 from hardware.pioreactor.mailbox import Mailbox
+from hardware.pioreactor.messages import NotHeard, OtherClient, ServerFailed, TurnedAway
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.web import NotHeard, Web
+from hardware.pioreactor.web import Web
 from hardware.reactor import Command, Measurement
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import SafetyConfig
@@ -60,7 +61,8 @@ class World(VirtualClock):
         self.web = self.queue = self.broker = self.stirs = True
         self.dies = self.mute = self.barred = self.deaf = self.stands = self.unkept = self.blind = False
         self.locks: set[int] = set()
-        self.heard, self.holder, self.begin_s, self.strikes = "yes", "", BEGIN_S, "add_media"
+        self.heard, self.begin_s, self.strikes = "yes", BEGIN_S, "add_media"
+        self.holder: OtherClient | None = None
         self.kill_after_s = self.freeze_after_s = self.stop_after_s = np.inf
         self.frozen_s = self.late_s = 0.0
         self.reading, self.od_alive, self.od_s = 0.5, False, OD_S
@@ -419,11 +421,11 @@ class FakeWeb:
             return self.active
         if path.startswith("/jobs/settings"):
             if "dosing_automation" not in self.world.rows:
-                raise NotHeard("status 404")
+                raise TurnedAway(url="http://pio01.local", status=404, reason="no")
             return {"settings": self.settings}
         if path == f"/workers/{UNIT}/experiment":
             if not self.world.assigned:
-                raise NotHeard("status 404")
+                raise TurnedAway(url="http://pio01.local", status=404, reason="no")
             return self.world.assigned
         return {
             "/health": {"pioreactor_unit": UNIT, "utc_time": "2026-11-21T00:00:00Z"},
@@ -435,11 +437,11 @@ class FakeWeb:
         w, task = self.world, f"task{next(self._count)}"
         dose = "ml" in options
         if dose and w.heard == "429":
-            raise NotHeard("status 429")
+            raise TurnedAway(url="http://pio01.local", status=429, reason="no")
         if dose and w.heard == "500":
-            raise ProtocolError("status 500")
+            raise ServerFailed(url="http://pio01.local", status=500, reason="no")
         if w.now() < w.accepted.get(job, -np.inf) + 1.0:  # one request a second for each job
-            raise NotHeard("status 429")
+            raise TurnedAway(url="http://pio01.local", status=429, reason="no")
         w.accepted[job] = w.now()
         w.asked.append((job, options))
         if job == "dosing_automation":
@@ -506,7 +508,7 @@ class FakeCluster:
     def hold(self) -> None:
         self.held = True
 
-    def holder(self, unit: str) -> str:
+    def holder(self, unit: str) -> OtherClient | None:
         return self.world.holder
 
     def close(self) -> None:

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
 
+from conf.messages import Message
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError
@@ -72,3 +74,20 @@ def posts(*paths: str) -> list[tuple[str, Reply | Exception]]:
 
 
 LOST = LinkError("no answer")
+
+
+def noted(rows: Sequence[dict[str, Any]], *kinds: type[Message]) -> list[dict[str, Any]]:
+    """The values of what a journal's rows note of these messages, or because of them."""
+    notes = [row for row in rows if row["kind"] == "note"]
+    found = [one for note in notes for one in (note, *note["fields"].values()) if isinstance(one, dict)]
+    return [one["fields"] for one in found if one["name"] in [kind.__name__ for kind in kinds]]
+
+
+def why(note: Message) -> type[Message]:
+    """Name what a note tells: of one that no dose was begun, the reason."""
+    return type(note.fields.get("why", note))
+
+
+def logged(caplog: pytest.LogCaptureFixture, *kinds: type[Message]) -> list[dict[str, Any]]:
+    """The values of these messages on the screen."""
+    return [record.msg.fields for record in caplog.records if isinstance(record.msg, kinds)]

@@ -20,8 +20,9 @@ import pytest
 
 from hardware.board import board_agent
 from hardware.board.board_agent import BoardAgent, Device, Proxy
-from hardware.errors import LinkError, ProtocolError
+from hardware.errors import LinkError
 from hardware.link.http import HttpTransport
+from hardware.link.messages import AgentNotReadable, AgentRefuses, SecretUnusable
 from hardware.link.open import open_transport
 from hardware.link.transport import TransportConfig, switched_off
 from tests.hardware.test_board_agent import TOKEN, AgentLab, Recorder, make_token
@@ -330,7 +331,7 @@ def test_after_silence_the_next_client_finds_the_pumps_off(tmp_path: Path) -> No
     "body", [b"", b"[]", b"{", b"{}", b'{"switched_off": 3}', b'{"switched_off": {"M0": {"Pump1": "x"}}}']
 )
 def test_a_status_that_is_no_agent_s_is_told_as_that_and_one_without_a_record_says_nothing(body: bytes) -> None:
-    with pytest.raises(ProtocolError, match="the board agent's status is not readable"):
+    with pytest.raises(AgentNotReadable):
         switched_off(body, 1.0)
 
 
@@ -355,7 +356,7 @@ def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
     (tmp_path / "other").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "other"))
     with open_transport(config, url) as foreign:
-        with pytest.raises(LinkError, match="another client is in charge"):
+        with pytest.raises(AgentRefuses):
             foreign.post("/foreign")
         monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
         with open_transport(config, url) as resumed:
@@ -372,19 +373,19 @@ def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
 def test_a_client_without_the_token_is_told_what_to_do(linked: Linked, tmp_path: Path) -> None:
     url, _ = linked
     bare = HttpTransport(url)
-    with pytest.raises(LinkError, match="no or wrong token.*backend.transport.token_file"):
+    with pytest.raises(AgentRefuses):
         bare.post("/changeDevice/M0")
     bare.disarm()
     bare.close()
     wrong = HttpTransport(url, config=TransportConfig(token_file=str(make_token(tmp_path, 64 * "f"))))
-    with pytest.raises(LinkError, match="no or wrong token"):
+    with pytest.raises(AgentRefuses):
         wrong.get("/getSysdata/")
     wrong.close()
     for text, mode, words in (("x", 0o600, "32 to 256"), (TOKEN, 0o640, "chmod 600"), ("é" * 40, 0o600, "32 to 256")):
         with pytest.raises(LinkError, match=words) as caught:
             HttpTransport(url, config=TransportConfig(token_file=str(make_token(tmp_path, text, mode))))
         assert TOKEN not in str(caught.value)
-    with pytest.raises(LinkError, match="No such file.*The token"):
+    with pytest.raises(SecretUnusable):
         HttpTransport(url, config=TransportConfig(token_file=str(tmp_path / "nothing")))
 
 

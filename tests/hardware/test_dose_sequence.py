@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf.messages import Message
+from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.dose_sequence import AGAIN, Context, DoseSequence
+from hardware.chibio.dose_sequence import Context, DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.protocol import Permitted
 from hardware.chibio.resume import ReactorHistory
@@ -19,7 +21,8 @@ from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Reply, Transport
 from hardware.logbook import Logbook
-from tests.hardware.script import DONE, answer, state
+from hardware.messages import DoseUnderWay, NoNewSample
+from tests.hardware.script import DONE, answer, state, why
 
 OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 3, 4, 2)]
 END = [*OFFS, "/MeasureTemp/IR/M0", "/changeDevice/M0"]
@@ -87,7 +90,9 @@ class Bench:
         self.known = self.known.after(row)
         self.rows.append({"posts": len(self.line.posts), **row})
 
-    def begin(self, rate: float = 0.01, key: Any = (60.0, 2), past_s: float = 0.0, refusal: str = "") -> DosePlan:
+    def begin(
+        self, rate: float = 0.01, key: Any = (60.0, 2), past_s: float = 0.0, refusal: Message | None = None
+    ) -> DosePlan:
         return self.doses.begin(rate, key, self.clock.now() - past_s, refusal)
 
     def run(self, seconds: float = math.inf) -> None:
@@ -129,20 +134,20 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lost", "sent", "fed_ml", "words"),
+    ("lost", "sent", "fed_ml", "told"),
     [
-        (WASTE_ON, [WASTE_ON], 0.0, "no dose: no answer"),
-        (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "what it did is looked for: no answer"),
+        (WASTE_ON, [WASTE_ON], 0.0, LinkError),
+        (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), messages.CommandLost),
     ],
 )
-def test_a_pump_command_without_an_answer_is_sent_once(lost: str, sent: list[str], fed_ml: float, words: str) -> None:
+def test_a_pump_command_without_an_answer_is_sent_once(lost: str, sent: list[str], fed_ml: float, told: Any) -> None:
     bench = Bench()
     bench.line.lost = {lost}
     assert bench.begin().feed_ml == fed_ml
     bench.run()
     assert [path for path in bench.line.sent() if path in (FEED_ON, WASTE_ON)] == sent
     assert ["/changeDevice/M0", *END] == bench.line.sent()[-7:]  # looked at before it is switched off
-    assert words in bench.book.notes[0]
+    assert why(bench.book.notes[0]) is told
     assert not bench.doses.running
     [end] = bench.of("dose_end")  # it was carried out, and it was the answer that was lost
     assert end["feed_ml"] == fed_ml
@@ -151,26 +156,25 @@ def test_a_pump_command_without_an_answer_is_sent_once(lost: str, sent: list[str
 
 
 @pytest.mark.parametrize(
-    ("sample", "past_s", "refusal", "words"),
+    ("sample", "past_s", "refusal", "told"),
     [
-        (None, 0.0, "", "no new sample"),
-        ((60.0, 2), math.inf, "", "unknown age"),
-        ((60.0, 2), 38.0 - WASTE_S + 0.01, "", "31 s after its sample appeared it would not end"),
-        ((60.0, 2), 0.0, "being started", "being started"),
+        (None, 0.0, None, NoNewSample),
+        ((60.0, 2), math.inf, None, messages.UnknownAge),
+        ((60.0, 2), 38.0 - WASTE_S + 0.01, None, messages.SampleTooOld),
+        ((60.0, 2), 0.0, messages.BeingStarted(), messages.BeingStarted),
     ],
 )
-def test_what_stands_in_the_way_of_a_dose(sample: Any, past_s: float, refusal: str, words: str) -> None:
+def test_what_stands_in_the_way_of_a_dose(sample: Any, past_s: float, refusal: Message | None, told: Any) -> None:
     bench = Bench()
     assert bench.begin(0.01, sample, past_s, refusal) == DosePlan()
-    assert words in bench.book.notes[0]
+    assert why(bench.book.notes[0]) is told
     assert bench.line.posts == []
     assert bench.of("intent") == []
     assert bench.begin(past_s=38.0 - WASTE_S).feed_ml > 0.0  # it is not remembered as acted on
     assert bench.begin(key=(120.0, 3)) == DosePlan()
-    assert "has not ended" in bench.book.notes[1]
     bench.run()
     assert bench.begin() == DosePlan()
-    assert "no new sample" in bench.book.notes[2]
+    assert [why(note) for note in bench.book.notes[1:]] == [DoseUnderWay, NoNewSample]
     bench.doses.acted = None
     assert bench.begin().feed_ml > 0.0
 
@@ -187,7 +191,7 @@ def test_a_read_back_that_takes_too_long_ends_the_dose_before_a_pump_is_on(late_
     bench.run()
     assert bench.line.sent()[-6:] == END
     assert len(bench.of("dose_end")) == 1
-    assert ("answers too slowly (31 s after the sample)" in "".join(bench.book.notes)) != begun
+    assert (messages.TooSlow in map(why, bench.book.notes)) != begun
 
 
 @pytest.mark.parametrize(
@@ -211,7 +215,7 @@ def test_a_dose_begins_only_where_the_device_shows_what_was_set(shown: dict[str,
     bench.line.shown = {}
     bench.run()
     assert bench.line.sent()[-6:] == END
-    assert begun or "not as set" in bench.book.notes[0]
+    assert begun or why(bench.book.notes[0]) is messages.NotAsSet
 
 
 def test_a_pump_that_stays_on_is_told_and_its_experiment_ended_at_the_fourth_refusal() -> None:
@@ -222,7 +226,7 @@ def test_a_pump_that_stays_on_is_told_and_its_experiment_ended_at_the_fourth_ref
     assert bench.line.sent().count("/Experiment/0/M0") == 1
     before_end = bench.line.sent()[: bench.line.sent().index("/Experiment/0/M0")]
     assert before_end.count("/MeasureTemp/IR/M0") == 4
-    assert "Pump1 still on" in bench.doses.stuck
+    assert "Pump1" in bench.doses.stuck
     assert bench.doses.running
     assert bench.doses.escalated
     bench.line.shown = {}
@@ -246,7 +250,7 @@ def test_a_reactor_that_is_gone_is_looked_for_every_half_minute() -> None:
 def test_what_is_kept_for_later_or_cut_off_is_told() -> None:
     small = Bench()
     assert small.begin(0.004) == DosePlan()
-    assert "0.240 mL is less than the pump can deliver" in small.book.notes[0]
+    assert [(type(n), n.fields) for n in small.book.notes] == [(messages.KeptForNextDose, {"ml": pytest.approx(0.24)})]
     assert small.line.posts == []
     assert small.begin(0.0, (120.0, 3)) == DosePlan()
     assert len(small.book.notes) == 1  # nothing was asked for
@@ -254,7 +258,7 @@ def test_what_is_kept_for_later_or_cut_off_is_told() -> None:
     assert [row["doses"] for row in small.of("intent")] == [0, 0, 1]
     weak = Bench(ReactorCalibration(PumpCalibration(flow_ml_s=0.2)))
     assert weak.begin(0.02).feed_ml == pytest.approx(0.63)
-    assert weak.book.notes == ["the dose was cut by 0.570 mL to the feed limit"]
+    assert [note.fields for note in weak.book.notes] == [{"ml": pytest.approx(0.57)}]
 
 
 @pytest.mark.parametrize("error", [LinkError("no answer"), ProtocolError("502"), DeviceStateError("gone")])
@@ -320,9 +324,9 @@ def test_what_the_device_repeats_until_the_end_is_heard_and_seen_is_told(
         assert (end["feed_ml"], end["waste_ml"], end["on_s"]) == (round(FEED_S, 3), round(WASTE_S, 3), 1.0)
     again = [(given.at_s, given.feed_ml) for given in bench.doses.extra if given.feed_ml > 0.0]
     assert again == [(1.0 + 63.0 * k, pytest.approx(FEED_S)) for k in range(1, times[0] + 1)]
-    told = AGAIN if until_then else f"was repeated up to {times[0]} times"
-    assert sum(told in note for note in bench.book.notes) == (times[0] > 0)
-    assert any("restarted" in note for note in bench.book.notes) == bool(shown)
+    kinds = {type(note) for note in bench.book.notes}
+    assert ((messages.ChangedInDose if until_then else messages.DoseRepeated) in kinds) == (times[0] > 0)
+    assert (messages.RestartedInDose in kinds) == bool(shown)
 
 
 def test_a_dose_that_is_cut_short_gave_less() -> None:
@@ -348,7 +352,7 @@ def test_after_targets_that_could_not_be_set_no_dose_begins_before_the_pumps_are
     assert bench.begin() == DosePlan()
     bench.run(5.0)
     assert bench.begin(key=(120.0, 3)) == DosePlan()
-    assert "has not ended" in bench.book.notes[-1]
+    assert why(bench.book.notes[-1]) is DoseUnderWay
     bench.line.trouble = lambda path: None
     bench.run()
     assert (ended(bench)["feed_ml"], ended(bench)["waste_ml"]) == (0.0, 0.0)
@@ -367,7 +371,7 @@ def supplied() -> Bench:
 def test_what_the_feed_put_off_is_not_given_by_a_supply_pump(supplied):
     assert supplied.begin(0.2 / 60.0).feed_ml == 0.0
     supplied.clock.sleep(60.0)
-    plan = supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), "", "Pump3")
+    plan = supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), None, "Pump3")
     assert plan.feed_ml == pytest.approx(0.5, abs=1e-3)
     assert supplied.doses.carry_ml == pytest.approx(0.2)
 
@@ -381,6 +385,6 @@ def test_of_two_commands_that_were_given_up_each_is_looked_for(supplied):
     supplied.begin(0.5 / 60.0)
     supplied.run(60.0)
     supplied.clock.sleep(60.0)
-    supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), "", "Pump3")
+    supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), None, "Pump3")
     supplied.run(60.0)
     assert [pump in supplied.doses._given_up for pump in ("Pump1", "Pump3", "Pump4")] == [True, True, False]

@@ -16,6 +16,7 @@ import pytest
 from hardware.chibio import ending as endings
 from hardware.chibio.dosing import PumpCalibration
 from hardware.chibio.ending import conclude, found
+from hardware.chibio.messages import DoseGave, DoseRepeated
 from hardware.chibio.protocol import PERIOD_S, DeviceState, parse_state
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
@@ -42,7 +43,7 @@ def read(feed: bool, waste: bool, start_time: str = START, **changes: Any) -> De
 
 def after(
     known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float = 101.0, off: dict[str, float] | None = None
-) -> tuple[Ending, str]:
+) -> tuple[Ending, Any]:
     """How the dose ended that is known and was looked at so, its pumps verified off at once; `off` by an agent."""
     row = found(known, state, now_s, seen_s, SILENCE_S, off)
     return conclude(known.after({"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)
@@ -50,9 +51,9 @@ def after(
 
 def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None:
     known = replace(OPEN, feed_off=(103.2, 103.3), waste_off=(110.0, 110.1))
-    ending, words = conclude(known, 110.5, PUMP, PUMP)
+    ending, told = conclude(known, 110.5, PUMP, PUMP)
     assert ending == Ending(100.0, 1.2, 9.0, 0, 0, 0, 0.0, 0.0, 1.2)
-    assert words == ""
+    assert told is None
     assert ending.beyond(1.2) == []
 
 
@@ -70,9 +71,9 @@ def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None
 )
 def test_a_dose_cut_short_lies_between_two(answered_s: float, off_s: float, most_ml: float, least_ml: float) -> None:
     known = replace(OPEN, feed_on=(100.0, answered_s), feed_off=(off_s, off_s + 0.1), waste_off=(130.0, 130.1))
-    ending, words = conclude(known, 131.0, PUMP, PUMP)
+    ending, told = conclude(known, 131.0, PUMP, PUMP)
     assert (ending.feed_ml, ending.feed_low_ml) == pytest.approx((most_ml, least_ml))
-    assert ("gave" in words) == (least_ml < 1.0)
+    assert isinstance(told, DoseGave) == (least_ml < 1.0)
 
 
 @pytest.mark.parametrize(
@@ -80,11 +81,11 @@ def test_a_dose_cut_short_lies_between_two(answered_s: float, off_s: float, most
     [(62.9, 0, 0.0), (63.5, 1, 0.5), (64.2, 1, 1.2), (125.9, 1, 1.2), (126.3, 2, 0.3), (900.0, 14, 1.2)],
 )
 def test_a_pump_left_on_repeats_every_63_s_its_last_dose_may_be_cut(on_s: float, times: int, last_ml: float) -> None:
-    ending, words = after(OPEN, read(True, True), 100.0 + on_s)
+    ending, told = after(OPEN, read(True, True), 100.0 + on_s)
     assert (ending.feed_times, ending.waste_times) == (times, int((on_s + 1.0) // 63))
     assert ending.feed_last_ml == pytest.approx(last_ml)
     assert ending.repeated_ml == pytest.approx(1.2 * max(times - 1, 0) + last_ml)
-    assert (f"repeated up to {times} times" in words) == (times > 0)
+    assert (told.fields["times"] if isinstance(told, DoseRepeated) else 0) == times
     assert REPEAT_S == PERIOD_S  # as the journal counts
 
 

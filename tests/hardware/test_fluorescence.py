@@ -10,13 +10,13 @@ import pytest
 
 from envs.plant.plant import Plant
 from hardware.board.board_agent import reduce_sysdata
+from hardware.chibio import messages
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.preflight import preflight
 from hardware.chibio.protocol import Permitted, check_command, parse_state
 from hardware.emulator.device import DeviceOptions, plant_preset
-from hardware.errors import DeviceStateError
 from hardware.family import Check
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.hardware.driver_lab import DriverLab
@@ -166,7 +166,7 @@ def test_what_somebody_changes_is_put_right_and_not_shown(key: str, value: Any, 
     assert math.isnan(sample(bench)[0])
     assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + toggled)
     assert sample(bench)[0] > 300.0
-    assert any(f"FP1 was found {found} and put right" in row["note"] for row in bench.of("note"))
+    assert [note["found"] for note in bench.notes(messages.PutRight)] == [found]
 
 
 def test_a_worker_that_lost_its_memory_gets_it_back() -> None:
@@ -196,8 +196,9 @@ def test_a_run_does_not_begin_where_it_cannot_be_had() -> None:
         return bench.wire.inner.post("/changeDevice/M0" if path == COMMAND else path)
 
     bench.wire.post = refuse
-    with pytest.raises(DeviceStateError, match="fluorescence slot FP1 is off after it was switched on; run the pref"):
+    with pytest.raises(messages.NotReady) as error:
         bench.reactors.begin()
+    assert error.value.fields["trouble"].row == messages.SlotAmiss(slot="FP1", found="off").row
 
 
 def test_a_frozen_sensor_repeats_exactly() -> None:
@@ -215,11 +216,11 @@ def test_a_frozen_sensor_repeats_exactly() -> None:
 def test_only_the_configured_toggle_may_be_sent() -> None:
     check_command(COMMAND, Permitted(("M0",), slot_command=COMMAND))
     for other in (COMMAND.replace("FP1", "FP2"), COMMAND.replace("x10", "x9")):
-        with pytest.raises(DeviceStateError, match="refused to send POST /SetFPMeasurement"):
+        with pytest.raises(messages.Forbidden):
             check_command(other, Permitted(("M0",), slot_command=COMMAND))
-    with pytest.raises(DeviceStateError, match="refused"):
+    with pytest.raises(messages.Forbidden):
         check_command(COMMAND, Permitted(("M0",)))
-    with pytest.raises(DeviceStateError, match="refused"):
+    with pytest.raises(messages.Forbidden):
         check_command("", Permitted(("M0",)))
 
 

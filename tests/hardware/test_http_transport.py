@@ -24,8 +24,9 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.protocol import Permitted
 from hardware.clock import DeviceClock, VirtualClock
 from hardware.emulator.process import EmulatorProcess
-from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.http import HttpTransport
+from hardware.link.messages import DeviceTaken
 from hardware.link.open import open_transport
 from hardware.link.transport import Reply, TransportConfig
 from hardware.logbook import no_log
@@ -167,7 +168,7 @@ def test_a_malformed_address_says_what_is_allowed(url: str) -> None:
 def test_one_client_per_device(server: Server) -> None:
     with (
         open_transport(TransportConfig(), server.url),
-        pytest.raises(DeviceStateError, match=f"process {os.getpid()}"),
+        pytest.raises(DeviceTaken),
         open_transport(TransportConfig(), server.url),
     ):
         pass

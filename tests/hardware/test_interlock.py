@@ -11,8 +11,9 @@ from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
-from hardware.reactor import Fault, Measurement, Receipt, Vitals
-from hardware.safety.config import DONE, REMEDIES, RESPONSES, Response, SafetyConfig
+from hardware.messages import Fault, LinkFault
+from hardware.reactor import Measurement, Receipt, Vitals
+from hardware.safety.config import DONE, Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
 
@@ -65,6 +66,7 @@ def only(verdict: Ruling) -> tuple[str, ...]:
 # -- every reason ----------------------------------------------------------------------------------------------------
 
 EMPTY, TUBE = {"rate": 0.02}, {"rate": 0.02, "waste_ml": np.zeros(1)}
+KINDS = {one.kind: one for one in Fault.__subclasses__() if one.__module__.startswith("hardware.")}
 TRIGGERS: dict[str, tuple[list[dict[str, Any]], Response]] = {
     "setpoint": ([{"setpoint": 5.0}], Response.HOLD),
     "controller": (4 * [{"rate": -0.001}], Response.HOLD),
@@ -95,7 +97,7 @@ LIMITS = {"budget": (SafetyConfig(ml_per_hour=2.0), None), "bottle": (None, Benc
 
 @pytest.mark.parametrize("kind", TRIGGERS | OF_DEVICES)
 def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_is_for_good(kind: str) -> None:
-    steps, response = TRIGGERS.get(kind) or ([{"fault": Fault(kind, "seen", "do this")}], OF_DEVICES[kind])
+    steps, response = TRIGGERS.get(kind) or ([{"fault": KINDS[kind]("seen")}], OF_DEVICES[kind])
     drive = Drive(*LIMITS.get(kind, (None, None)))
     verdict = drive()
     assert (verdict.rate[0], verdict.response[0], verdict.reasons) == (0.008, Response.PASS, [None])
@@ -109,7 +111,7 @@ def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_i
     assert 0.0 < verdict.setpoint[0] <= 1.5
     line = str(verdict.reasons[0])
     assert line.startswith(f"{kind}: ")
-    assert line.endswith("seen; do this; " + DONE[response] if kind in OF_DEVICES else REMEDIES[kind])
+    assert line.endswith(f"{DONE[response]}; {verdict.faults[0][-1].remedy}".rstrip("; "))
     later = drive(od=0.512, raw=9000.0)
     assert later.heat_off[0] == verdict.heat_off[0]  # for good
     if response >= Response.REGULATE:
@@ -120,7 +122,7 @@ def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_i
 
 def test_every_declared_reason_is_tried() -> None:
     elsewhere = {"no_dilution", "cannot_hold", "fluorescence", "fluorescence_lost", "command_limit"}
-    assert set(TRIGGERS) | set(OF_DEVICES) | elsewhere == set(RESPONSES)
+    assert set(TRIGGERS) | set(OF_DEVICES) | elsewhere == set(KINDS)
 
 
 # -- against a plant -------------------------------------------------------------------------------------------------
@@ -214,7 +216,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
     for _ in range(500):
         now += float(rng.choice([0.0, 1.0, 30.0, 60.0, 61.0, 150.0, 5000.0], p=[0.05, 0.1, 0.1, 0.5, 0.2, 0.04, 0.01]))
         fresh, od, rate, setpoint = rng.random(n) < 0.8, strange(0.45, 0.55), strange(0.0, 0.03), strange(0.3, 0.8)
-        faults = tuple(Fault("link", "x", "y") if rng.random() < 0.05 else None for _ in range(n))
+        faults = tuple(LinkFault("x") if rng.random() < 0.05 else None for _ in range(n))
         vitals = Vitals(rng.uniform(0.0, 130.0, n), strange(4000.0, 12000.0), faults)
         m = Measurement(np.full(n, now), od, strange(36.0, 38.0), fresh, vitals)
         v = interlock.check(m, rate, setpoint, strange(36.0, 38.0), now)

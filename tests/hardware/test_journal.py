@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
-from hardware.errors import RecordingError
 from hardware.family import Opening
 from hardware.storage.journal import Journal, read_journal
+from hardware.storage.messages import NotOpened, NotWritten
 
 
 def test_rows_come_back_in_order_with_number_and_time(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_rows_come_back_in_order_with_number_and_time(tmp_path: Path) -> None:
     assert again.next_row == 2
     again.close()
     again.close()
-    with pytest.raises(RecordingError, match="closed"):
+    with pytest.raises(NotWritten):
         again.append("x", {})
 
 
@@ -73,9 +73,9 @@ def test_a_file_cut_anywhere_keeps_every_whole_row(tmp_path: Path, cut: int) -> 
 
 
 def test_a_missing_folder_or_file_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="check folder"):
+    with pytest.raises(NotOpened):
         Journal(tmp_path / "no" / "j")
-    with pytest.raises(RecordingError, match="folder of a run"):
+    with pytest.raises(NotOpened):
         read_journal(tmp_path / "j")
 
 
@@ -95,7 +95,7 @@ def test_a_stop_in_a_row_cuts_and_doubles_none(tmp_path: Path, monkeypatch: pyte
             journal.append("stopped", {})
     with monkeypatch.context() as patched:
         patched.setattr(os, "write", lambda file, line: write(file, line[:7]))
-        with pytest.raises(RecordingError, match="No space left"):
+        with pytest.raises(NotWritten):
             journal.append("full disk", {})
     journal.append("last", {})
     journal.close()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hardware.chibio import messages
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
@@ -15,6 +16,7 @@ from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.server import build, parser
 from hardware.emulator.vial import VialConfig
 from hardware.errors import DeviceStateError
+from hardware.messages import NotLeftOff
 from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.script import state
 
@@ -107,7 +109,7 @@ def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "found off"), ("/SetOutputTarget/Pump3/M0/0.1", "a duty of 0.1")]
+    ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "off"), ("/SetOutputTarget/Pump3/M0/0.1", "at a duty of 0.1")]
 )
 @pytest.mark.parametrize("anew", [False, True])
 def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, found: str, anew: bool) -> None:
@@ -120,9 +122,7 @@ def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, foun
     lab.device.handle("POST", path)
     lab.run(2)
     assert runs(lab)
-    notes = [row["note"] for row in lab.of("note") if "overflow pump" in row["note"]]
-    assert len(notes) == 1
-    assert found in notes[0]
+    assert [note["found"] for note in lab.notes(messages.PutRight)] == [found]
     assert lab.kinds() <= {"jump"} if anew else not lab.kinds()  # to a new run the culture is as it is
     assert lab.samples[0] >= 5
 
@@ -158,13 +158,9 @@ def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is
 
 
 @pytest.mark.parametrize(
-    ("fault", "value", "words"),
-    [
-        ("lying", 1, "Pump3, is off after it was set to 0.5 and on; run the preflight"),
-        ("reset_before", -1, "reset; pumps not verified off: M0: .*reset.*by hand now"),
-    ],
+    ("fault", "value", "error"), [("lying", 1, messages.NotReady), ("reset_before", -1, NotLeftOff)]
 )
-def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on_or_says_so(fault: str, value: int, words: str) -> None:
+def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on_or_says_so(fault: str, value: int, error: Any) -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(90.0)
@@ -177,7 +173,7 @@ def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on_or_says_so(fault:
         return reply or real(path)
 
     lab.on_post(deaf)
-    with pytest.raises(DeviceStateError, match=words):
+    with pytest.raises(error):
         lab.reactors.begin()
     assert fault != "lying" or lab.motors_off()
 
@@ -272,7 +268,7 @@ def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
     lab.resume(300.0)
     lab.run(2)
     assert runs(lab)
-    assert ["the overflow pump was found off" in row["note"] for row in lab.of("note")][-1]
+    assert lab.notes(messages.PutRight)[-1]["found"] == "off"
 
 
 # -- what it prevents ------------------------------------------------------------------------------------------------

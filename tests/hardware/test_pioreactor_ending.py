@@ -11,10 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from conf.messages import Message
+from hardware.pioreactor import messages
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.pumps import Seen, is_off
 from hardware.pioreactor.versions import TESTED
 from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World, sampled
+from tests.hardware.script import noted
 
 MEDIA_S, SLACK_ML = 1.4 / FLOW["add_media"], 0.1
 BACK_S = 100.0  # after what was wrong is over, until a dose is possible again
@@ -26,14 +29,14 @@ STIRRED = pytest.mark.parametrize("stirring", [True, False], ids=["stirred", "un
 class Wrong:
     """What goes wrong in a dose of 1.4 mL; over after `lasts_s` by itself, or by a hand that does `mend`.
 
-    told: a word of the fault that is seen meanwhile or of the dose's end, "" where none must be. gives: mL that are
-    on record and in the vial, None where they are bounds. back_s: after it is over, until a dose is possible again.
+    told: one of these is the fault that is seen meanwhile or the dose's end, none where none must be. gives: mL that
+    are on record and in the vial, None where they are bounds. back_s: after it is over, until a dose is possible again.
     """
 
     act: Callable[[Lab], None]
     lasts_s: float = 0.0
     mend: Callable[[Lab], None] | None = None
-    told: str = ""
+    told: tuple[type[Message], ...] = ()
     gives: float | None = None
     back_s: float = BACK_S
 
@@ -103,64 +106,63 @@ def theirs(lab: Lab) -> None:
 
 
 UNKEPT = killed(0.01, unkept=True)
+PLUG = (messages.RunsOn, messages.MayRunOn)
+GONE, UNDONE = (messages.NoBroker,), (messages.NotCarriedOut,)
+PIN = (*PLUG, messages.BeingVerified)
 WASTE = {"strikes": "remove_waste"}
 WRONG = {
-    "killed": Wrong(killed(0.2), 40.0, unlock, "pwm_locks 13"),
-    "killed at once": Wrong(killed(0.0), 40.0, unlock, "pwm_locks 13"),
-    "killed before it told its pin": Wrong(killed(0.01, mute=True), 70.0, unlock, "pwm_locks 13"),
-    "killed before its unit knew": Wrong(UNKEPT, 70.0, unlock, "pwm_locks 13"),
-    "killed before its unit knew, and rebooted": Wrong(UNKEPT, 70.0, both(cut, power), "pwm_locks 13"),
+    "killed": Wrong(killed(0.2), 40.0, unlock, PLUG),
+    "killed at once": Wrong(killed(0.0), 40.0, unlock, PLUG),
+    "killed before it told its pin": Wrong(killed(0.01, mute=True), 70.0, unlock, PLUG),
+    "killed before its unit knew": Wrong(UNKEPT, 70.0, unlock, PLUG),
+    "killed before its unit knew, and rebooted": Wrong(UNKEPT, 70.0, both(cut, power), PLUG),
     "killed before its unit knew, not drained, and rebooted": Wrong(
-        both(UNKEPT, lambda lab: lab.world.locks.add(WASTE_PIN)), 70.0, both(cut, power), "pwm_locks 13"
+        both(UNKEPT, lambda lab: lab.world.locks.add(WASTE_PIN)), 70.0, both(cut, power), PLUG
     ),
-    "killed, and rebooted as a drain begins": Wrong(
-        killed(0.2), 30.0, both(cut_as_a_drain_begins, power), "pwm_locks 13"
-    ),
-    "killed, and rebooted": Wrong(killed(0.2), 40.0, both(cut, power), "pwm_locks 13"),
-    "killed, queue dead": Wrong(
-        both(killed(0.2), in_the_dose(world(queue=False))), 60.0, both(unlock, revive), "pwm_locks 13"
-    ),
+    "killed, and rebooted as a drain begins": Wrong(killed(0.2), 30.0, both(cut_as_a_drain_begins, power), PLUG),
+    "killed, and rebooted": Wrong(killed(0.2), 40.0, both(cut, power), PLUG),
+    "killed, queue dead": Wrong(both(killed(0.2), in_the_dose(world(queue=False))), 60.0, both(unlock, revive), PLUG),
     "killed, web server dead": Wrong(
-        both(killed(0.2), in_the_dose(world(web=False))), 60.0, both(unlock, world(web=True)), "pwm_locks 13"
+        both(killed(0.2), in_the_dose(world(web=False))), 60.0, both(unlock, world(web=True)), PLUG
     ),
-    **{
-        f"frozen {s:g} s": Wrong(frozen(0.01, s), s, told="media pump (pin 13)" if s > 8.0 else "")
-        for s in (0.01, 1.0, 7.0, 14.0)
-    },
-    **{f"frozen {s:g} s in it": Wrong(frozen(0.6, s), s, told="media pump (pin 13)") for s in (20.0, 60.0)},
-    "frozen 60 s before its unit knew": Wrong(frozen(0.01, 60.0, unkept=True), 60.0, told="media pump (pin 13)"),
+    **{f"frozen {s:g} s": Wrong(frozen(0.01, s), s, told=PIN if s > 8.0 else ()) for s in (0.01, 1.0, 7.0, 14.0)},
+    **{f"frozen {s:g} s in it": Wrong(frozen(0.6, s), s, told=PIN) for s in (20.0, 60.0)},
+    "frozen 60 s before its unit knew": Wrong(frozen(0.01, 60.0, unkept=True), 60.0, told=PIN),
     "frozen before its unit knew, and somebody's request refused": Wrong(
-        both(frozen(0.01, 60.0, unkept=True), theirs), 60.0, told="media pump (pin 13)"
+        both(frozen(0.01, 60.0, unkept=True), theirs), 60.0, told=PIN
     ),
     "broker lost": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3.0)), 3.0),
-    "broker lost for an hour": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3600.0)), 3600.0, told="no MQTT"),
-    "broker frozen": Wrong(in_the_dose(lambda lab: lab.world.freeze_broker(25.0)), 25.0, told="no MQTT"),
-    "broker frozen before it": Wrong(lambda lab: lab.world.freeze_broker(25.0), 25.0, told="no MQTT"),
-    "power cut of 90 s": Wrong(in_the_dose(cut), 90.0, power, "media pump (pin 13)"),
-    "power cut of a night": Wrong(in_the_dose(cut), 9 * 3600.0, power, "media pump (pin 13)"),
-    "stopped by somebody": Wrong(world(stop_after_s=0.803), told="ended early"),
+    "broker lost for an hour": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3600.0)), 3600.0, told=GONE),
+    "broker frozen": Wrong(in_the_dose(lambda lab: lab.world.freeze_broker(25.0)), 25.0, told=GONE),
+    "broker frozen before it": Wrong(lambda lab: lab.world.freeze_broker(25.0), 25.0, told=GONE),
+    "power cut of 90 s": Wrong(in_the_dose(cut), 90.0, power, PIN),
+    "power cut of a night": Wrong(in_the_dose(cut), 9 * 3600.0, power, PIN),
+    "stopped by somebody": Wrong(world(stop_after_s=0.803), told=(messages.ToldLess,)),
     "pumps off in between": Wrong(in_the_dose(lambda lab: lab.reactors.pumps_off(np.array([True])))),
     "a pump without a job": Wrong(lambda lab: lab.world.pin("add_media", True)),
     "its words were lost": Wrong(world(mute=True)),
     # in its waste
-    "waste killed": Wrong(killed(0.4, **WASTE), 20.0, unlock, "pwm_locks 12", 1.4),
+    "waste killed": Wrong(killed(0.4, **WASTE), 20.0, unlock, PLUG, 1.4),
     "waste frozen 3 s": Wrong(frozen(0.4, 3.0, **WASTE), 3.0, gives=1.4),
     "waste stopped by somebody": Wrong(world(stop_after_s=0.803, **WASTE), gives=1.4),
     "waste, broker lost": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3.0), 0.2, WASTE_PIN), 3.0, gives=1.4),
     "waste, broker lost for an hour": Wrong(
-        in_the_dose(lambda lab: lab.world.lose_broker(3600.0), 0.2, WASTE_PIN), 3600.0, told="no MQTT", gives=1.4
+        in_the_dose(lambda lab: lab.world.lose_broker(3600.0), 0.2, WASTE_PIN),
+        3600.0,
+        told=GONE,
+        gives=1.4,
     ),
-    "waste, power cut of 90 s": Wrong(in_the_dose(cut, 0.2, WASTE_PIN), 90.0, power, "waste pump (pin 12)", 1.4),
+    "waste, power cut of 90 s": Wrong(in_the_dose(cut, 0.2, WASTE_PIN), 90.0, power, PIN, 1.4),
     # odd answers of the vendor's software
-    "a lock left behind": Wrong(lambda lab: lab.world.locks.add(MEDIA_PIN), 25.0, unlock, "cache", 0.0),
-    "accepted, and died at once": Wrong(world(dies=True), 20.0, told="accepted and not carried out", gives=0.0),
-    "a dead queue that runs it late": Wrong(world(queue=False), 60.0, revive, "unknown", 1.4),
-    "a dead queue that is forgotten": Wrong(world(queue=False), 20.0, forget, "unknown", 0.0, 200.0),
-    "begins late": Wrong(world(begin_s=25.0), 25.0, told="unknown", gives=1.4),
+    "a lock left behind": Wrong(lambda lab: lab.world.locks.add(MEDIA_PIN), 25.0, unlock, UNDONE, 0.0),
+    "accepted, and died at once": Wrong(world(dies=True), 20.0, told=UNDONE, gives=0.0),
+    "a dead queue that runs it late": Wrong(world(queue=False), 60.0, revive, (messages.FateUnknown,), 1.4),
+    "a dead queue that is forgotten": Wrong(world(queue=False), 20.0, forget, (messages.FateUnknown,), 0.0, 200.0),
+    "begins late": Wrong(world(begin_s=25.0), 25.0, told=(messages.FateUnknown,), gives=1.4),
     "heard, its answer lost": Wrong(world(heard="lost answer"), gives=1.4),
-    "not heard, its answer lost": Wrong(world(heard="nobody"), 20.0, told="unknown", gives=0.0),
+    "not heard, its answer lost": Wrong(world(heard="nobody"), 20.0, told=(messages.FateUnknown,), gives=0.0),
     "too many requests": Wrong(world(heard="429"), gives=0.0, back_s=1.0),
-    "an error of the server": Wrong(world(heard="500"), 20.0, told="unknown", gives=0.0),
+    "an error of the server": Wrong(world(heard="500"), 20.0, told=(messages.FateUnknown,), gives=0.0),
     "web server dead": Wrong(world(web=False), 1.0, world(web=True), gives=0.0, back_s=1.0),
     "ends 1 s late": Wrong(world(late_s=1.0), gives=1.4 + FLOW["add_media"]),
     "somebody's request refused in it": Wrong(in_the_dose(theirs), gives=1.4),
@@ -212,15 +214,15 @@ def test_every_way_back(monkeypatch, name, version, stirring):
     planned = lab.dose(1.4) if name != "a pump without a job" else 0.0
     wrong.act(lab)
     lab.wait(5.0)
-    seen = [str(lab.fault)]
+    seen = [lab.fault]
     for _ in range(int(min(wrong.lasts_s, 120.0) * 2)):
         lab.wait(0.5)
-        seen.append(str(lab.fault))
+        seen.append(lab.fault)
     lab.world.sleep(max(wrong.lasts_s - 120.0, 0.0))
     if wrong.mend:
         wrong.mend(lab)
     lab.until(lambda: lab.fault is None and not lab.station.doses.running, wrong.back_s)
-    assert wrong.told in " ".join([*seen, *(row["end"] for row in lab.of("dose_end"))])
+    assert not wrong.told or any(isinstance(fault, wrong.told) for fault in seen) or noted(lab.rows, *wrong.told)
     settle(lab)
     assert not lab.world.since, "every pump is off"
     low, high = lab.given()
@@ -270,7 +272,7 @@ def test_while_a_media_pump_runs_on_the_vial_is_drained_up_to_a_bound(monkeypatc
         assert lab.world.level_ml + rise_ml < 28.0
     lab.wait(60.0)
     assert least < sum(o["ml"] for o in lab.asked("remove_waste")) <= 2.0 * bottle_ml + 4.0
-    assert "the media pump (pin 13) runs on" in str(lab.fault)
+    assert (type(lab.fault), lab.fault.fields["pin"]) == (messages.RunsOn, MEDIA_PIN)
 
 
 @pytest.mark.parametrize("waste_ml_s", [1.6, FLOW["add_media"]])
@@ -335,10 +337,12 @@ def test_nobody_is_told_to_pull_a_plug_where_only_the_broker_was_gone(monkeypatc
     in_the_dose(lambda lab: getattr(lab.world, broken)(20.0))(lab)
     seen = set()
     while lab.station.doses.running or lab.fault:
-        seen |= {str(lab.fault), *(lab.reactors.pumps_off(np.array([True])) if lab.world.broker else ())}
+        seen |= {type(lab.fault)}
+        told = lab.reactors.pumps_off(np.array([True])) if lab.world.broker else ()
+        assert not [line for line in told if "plug" in line]
         lab.wait(0.1)
-    assert any("broker" in fault for fault in seen)
-    assert not [fault for fault in seen if "plug" in fault]
+    assert messages.NoBroker in seen
+    assert not seen & set(PLUG)
 
 
 def test_short_runs_of_a_pump_do_not_pile_up_in_a_queue_that_is_dead(monkeypatch):

@@ -13,19 +13,20 @@ import pytest
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from hardware.clock import VirtualClock
-from hardware.errors import DeviceStateError, LinkError
+from hardware.errors import DeviceStateError
 from hardware.family import Opening
+from hardware.pioreactor import messages
 from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.doses import replay
 from hardware.pioreactor.family import FAMILY
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.station import UNHEARD
 from hardware.pioreactor.versions import TESTED, facts, flow, regulates, request
 from hardware.pioreactor.web import Web
 from hardware.rig import family as rig
 from tests.hardware.pioreactor_lab import UNIT, Lab, World, sampled
+from tests.hardware.script import noted
 
 
 @pytest.fixture
@@ -49,8 +50,8 @@ def test_what_a_reboot_ended_is_named_started_again_and_holds_doses(monkeypatch,
     lab.world.say(f"{job}/$state", "lost")
     for _ in range(5):  # as long as it is gone, also between two attempts
         lab.wait(13.0)
-        assert (lab.fault.kind, said in lab.fault.detail) == ("stopped", True)
-        assert f"on the unit: {forget.format(job)}" in lab.fault.remedy
+        assert (type(lab.fault), lab.fault.fields["gone"]) == (messages.JobGone, said)
+        assert lab.fault.fields["command"].startswith(forget.format(job))
     assert lab.dose(0.5) == 0.0
     assert 2 <= len(started(lab, job)) - 1 <= 4
     lab.world.barred = False
@@ -75,12 +76,13 @@ def test_a_resumed_run_heats_to_what_was_set_last_and_not_to_the_first_temperatu
 
 def test_a_unit_that_was_given_up_is_regulated_by_nobody_any_more_and_says_so_of_each_dose(lab):
     """It was handed over before; after a reboot the vendor's turbidostat stays away, too."""
-    for turn, word in ((lab.reactors.regulate, "the unit regulates itself"), (lab.reactors.give_up, "was given up")):
+    turns = (lab.reactors.regulate, messages.RegulatesItself), (lab.reactors.give_up, messages.GivenUp)
+    for turn, told in turns:
         assert turn(*(np.array([True]), np.array([0.6]))[: 1 + (turn == lab.reactors.regulate)]) == []
         assert lab.reactors.handed_over.tolist() == [turn == lab.reactors.regulate]
         lab.sample()
         assert lab.dose(0.5) == 0.0
-        assert word in lab.receipt.notes[-1]
+        assert noted(lab.rows[-1:], told)
     lab.world.rows.pop("dosing_automation", None)
     lab.world.say("dosing_automation/$state", "lost")
     lab.wait(60.0)
@@ -236,7 +238,7 @@ def test_photodiode_and_tube_are_judged_by_channel_and_volume_of_their_own_unit(
     """Which sees the culture by 1, and has the reference at 2, that of all other units, whose vials are larger."""
     web: Any = Said({"1": "90", "2": "REF", "3": "", "4": ""}, tube)
     monkeypatch.setattr(pioreactors, "Web", lambda *_given: web)
-    monkeypatch.setattr(pioreactors, "Cluster", lambda *_given: SimpleNamespace(holder=lambda name: ""))
+    monkeypatch.setattr(pioreactors, "Cluster", lambda *_given: SimpleNamespace(holder=lambda name: None))
     config = PioreactorConfig(reactors=("pio01", "pio02"), units={"pio02": UnitConfig(channel=channel)}, channel="2")
     units = PioreactorReactors(config, VirtualClock(), bench=Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0}))
     checks = {check.name: check for check in _unit(units.stations[1], units)}
@@ -323,7 +325,7 @@ def test_nothing_is_dosed_before_the_unit_told_a_pin_that_was_switched(monkeypat
     lab.world.blind = True
     lab.begin()
     lab.sample()
-    assert (lab.fault.kind, lab.fault.detail) == ("pump", UNHEARD)
+    assert isinstance(lab.fault, messages.PinsUntold)
     assert lab.dose(0.5) == 0.0
     lab.world.blind = False
     lab.until(lambda: lab.fault is None, 20.0)
@@ -346,7 +348,7 @@ def test_pins_that_are_told_no_more_hold_doses_after_two_of_them(monkeypatch, st
         doses.append(lab.dose(0.5))
         lab.wait(8.0)
     assert doses == [0.5, 0.5, 0.5, 0.0, 0.0]
-    assert (lab.fault.kind, lab.fault.detail) == ("pump", UNHEARD)
+    assert isinstance(lab.fault, messages.PinsUntold)
     assert lab.given() == pytest.approx((1.5, 1.5), abs=0.1)
     lab.world.blind = False
     lab.until(lambda: lab.fault is None, 20.0)
@@ -372,19 +374,19 @@ def test_a_reader_that_publishes_nothing_is_told_with_what_its_log_says(monkeypa
     lab.world.say("logs/app/error", json.dumps({**said, "task": "stirring", "message": "no reading of the rpm"}))
     lab.world.say("logs/app/error", json.dumps(said))
     lab.until(lambda: lab.fault is not None, 60.0)
-    assert (lab.fault.kind, BELOW in lab.fault.detail, "reboot" in lab.fault.remedy) == ("stopped", True, True)
+    assert (type(lab.fault), lab.fault.fields) == (messages.ReaderComplains, {"log": BELOW})
     lab.world.od_s, lab.world.od_alive = 5.0, True
     lab.world._read()
     lab.until(lambda: lab.fault is None, 60.0)
     lab.world.od_alive = False
     lab.until(lambda: lab.fault is not None, 100.0)
-    assert BELOW not in lab.fault.detail, "it has read since"
+    assert isinstance(lab.fault, messages.JobGone), "it has read since"
 
 
 def test_a_web_server_that_does_not_answer_is_told_within_a_minute(lab):
     lab.world.web = False
     assert lab.until(lambda: lab.fault is not None, 60.0) > 10.0, "not every request that fails is a fault"
-    assert (lab.fault.kind, "http://pio01.local: refused" in lab.fault.detail) == ("link", True)
+    assert isinstance(lab.fault, messages.WebServerSilent)
     lab.world.web = True
     lab.until(lambda: lab.fault is None, 30.0)
 
@@ -400,7 +402,7 @@ def test_a_flow_is_read_from_every_kind_of_curve():
     flows = [flow(calibrations, pump) for pump in ("media_pump", "waste_pump", "alt_media_pump")]
     assert flows == pytest.approx([0.62, 1.4, (0.5 + 2.4 + 8.0) / 21.0])
     for curve in ([0.0, 0.5], [-0.3, 0.1], ["x", 0.0], [0.5], {"type": "poly"}, {"type": "spline"}, None):
-        with pytest.raises(DeviceStateError, match="no active calibration of the media_pump .*Calibrations, media"):
+        with pytest.raises(messages.NotCalibrated):
             flow({"media_pump": {"curve_data_": curve}, "waste_pump": {"curve_data_": [0.5, 0.0]}}, "media_pump")
 
 
@@ -428,7 +430,7 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
         experiment={"experiment": "older"},
     )
     unit = SimpleNamespace(web=web, leader=web, config=config.of("pio02"), volume_ml=14.0)
-    mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
+    mqtt = SimpleNamespace(holder=lambda name: messages.OtherClient(pid=7, host="lab", unit=name, topic="it"))
     web.settings["PWM"] = {"1": "stirring", "2": "waste", "4": "media"}
     web.settings["od_reading.config"] = {"ref_normalization": "unity"}
     doses = SimpleNamespace(pumps=SimpleNamespace(jobs=("add_media", "remove_waste")))
@@ -445,7 +447,7 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     assert checks["dosing"].detail == "add_alt_media, circulate_media"
     assert "pio jobs remove --job-name add_alt_media" in checks["dosing"].remedy
     assert checks["client"].detail == "process 7 on lab controls pio02: one client per unit"
-    assert checks["client"].remedy == "clear it"
+    assert checks["client"].remedy.endswith("it")
     pumps = [checks[f"{pump}_pump"].detail for pump in ("media", "waste")]
     assert pumps == ["0.700 mL/s at its calibrated duty", "1.600 mL/s at its calibrated duty"]
     assert checks["volume"].detail == "not set mL in its settings, 14 here"
@@ -468,10 +470,12 @@ def test_a_broker_that_does_not_answer_is_waited_for_half_a_minute_and_one_that_
     lab = Lab(monkeypatch, broker="lead.local", broker_port=1884)
     lab.world.broker = False
     began = lab.world.now()
-    with pytest.raises(LinkError, match=r"MQTT broker lead\.local:1884: no answer in 30 s; check backend\.username"):
+    with pytest.raises(messages.BrokerRefuses) as silent:
         lab.reactors.connect()
+    assert silent.value.fields["broker"] == "lead.local:1884"
     assert lab.world.now() - began == pytest.approx(30.0, abs=0.2)
     lab.reactors.mqtt.refusal, began = "Not authorized", lab.world.now()
-    with pytest.raises(LinkError, match=r"lead\.local:1884: Not authorized; check"):
+    with pytest.raises(messages.BrokerRefuses) as refused:
         lab.reactors.connect()
+    assert refused.value.fields["why"] == "Not authorized"
     assert lab.world.now() == began

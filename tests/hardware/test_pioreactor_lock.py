@@ -8,19 +8,20 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hardware.clock import RealClock
-from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.pioreactor.messages import OtherClient, UnitTaken
 from hardware.rig.build import broker
 from hardware.rig.processes import _free_port
 from tests.hardware.pioreactor_lab import UNIT, Lab
 from tests.hardware.test_emulator_server import until
 
-HELD = "process 7 on elsewhere controls pio01: one client per unit; remedy"
+HELD = OtherClient(pid=7, host="elsewhere", unit=UNIT, topic="lock")
 
 
 @contextmanager
@@ -76,28 +77,34 @@ def killable(port: int) -> Iterator[int]:
         process.join()
 
 
+def held(cluster: Any) -> str:
+    """By which process the first unit is."""
+    other = cluster.holder("pio01")
+    return str(other.fields["pid"]) if other else ""
+
+
 @pytest.mark.slow
 def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come_back(port: int) -> None:
     other = client(port, "run2", "pio01", "pio02")
     first = client(port, "run1", "pio01")
     first.hold()
-    assert until(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
-    assert other.holder("pio02") == first.holder("pio01") == ""
+    assert until(lambda: held(other) == str(os.getpid()))
+    assert other.holder("pio02") is first.holder("pio01") is None
     first.close()
-    assert until(lambda: other.holder("pio01") == "")
+    assert until(lambda: other.holder("pio01") is None)
     with killable(port) as pid:
-        assert until(lambda: f"process {pid} on " in other.holder("pio01"))
+        assert until(lambda: held(other) == str(pid))
         late = client(port, "run3", "pio01")
-        assert until(lambda: late.holder("pio01") != "")  # it is retained
+        assert until(lambda: late.holder("pio01") is not None)  # it is retained
         late.close()
-    assert until(lambda: other.holder("pio01") == "")
+    assert until(lambda: other.holder("pio01") is None)
     with killable(port) as pid:
-        assert until(lambda: f"process {pid} on " in other.holder("pio01"))
+        assert until(lambda: held(other) == str(pid))
         os.kill(pid, signal.SIGSTOP)  # gone, and the broker still believes in it
         again = client(port, "run1", "pio01")
         again.hold()
-        assert until(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
-        assert again.holder("pio01") == ""
+        assert until(lambda: held(other) == str(os.getpid()))
+        assert again.holder("pio01") is None
         again.close()
     other.close()
 
@@ -106,11 +113,11 @@ def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come
 def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
     other, first = client(port, "run2", "pio01"), client(port, "run1", "pio01")
     first.hold()
-    assert until(lambda: other.holder("pio01") != "")
+    assert until(lambda: other.holder("pio01") is not None)
     first._client.socket().shutdown(2)  # the broker sends the last will
     assert until(lambda: first.broke_s > 0.0 and first.connected)
     assert "closed" in first.lost
-    assert until(lambda: other.holder("pio01") != "")
+    assert until(lambda: other.holder("pio01") is not None)
     first.close()
     other.close()
 
@@ -118,7 +125,7 @@ def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
 def test_a_unit_of_another_client_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(monkeypatch)
     lab.world.holder = HELD
-    with pytest.raises(DeviceStateError, match="process 7 on elsewhere controls pio01"):
+    with pytest.raises(UnitTaken):
         lab.begin()
     assert not lab.world.asked
 
@@ -130,7 +137,6 @@ def test_a_second_client_in_the_run_holds_our_doses(monkeypatch: pytest.MonkeyPa
     lab.sample()
     lab.world.holder = HELD
     lab.wait(1.0)
-    assert lab.fault.kind == "mode"
+    assert (lab.fault.kind, lab.fault.fields["unit"]) == ("mode", UNIT)
     assert lab.dose(0.5) == 0.0
     assert not lab.asked("add_media")
-    assert UNIT in str(lab.fault)

@@ -8,10 +8,12 @@ import pytest
 
 from envs.bench import Bench
 from envs.scenario import Scenario
+from hardware.chibio import messages
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.emulator.device import DeviceOptions
-from hardware.errors import DeviceStateError, RecordingError
+from hardware.errors import RecordingError
+from hardware.messages import PumpsNotOff
 from hardware.reactor import Command
 from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.emulator_lab import BIAS_S, quiet
@@ -132,7 +134,7 @@ def test_a_thermostat_lost_to_the_restart_trap_is_switched_on_again() -> None:
     lab.reactors.begin()
     lab.run(4)
     assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 1
-    assert [row["note"] for row in lab.of("note") if "Thermostat was off" in row["note"]]
+    assert [note for note in lab.notes(messages.PutRight) if note["item"] == "Thermostat"]
 
 
 @pytest.mark.parametrize("phase_s", [1.0, 6.0, 9.0, 30.0])
@@ -165,18 +167,18 @@ def test_a_stopped_experiment_is_started_at_once_if_it_has_ended(named: int, res
     before = lab.clock.now()
     lab.reactors.begin()
     assert (lab.clock.now() - before > 65.0) is waits
-    assert any("waits 70 s" in row["note"] for row in lab.of("note")) is waits
+    assert bool(lab.notes(messages.OldCycle)) is waits
     lab.run(3)
     assert lab.samples[0] >= 2
     data = lab.device.apps["M0"].data
     assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
-    assert not [row for row in lab.of("note") if "was off" in row["note"]]
+    assert not lab.notes(messages.PutRight)
 
 
 def test_zigzag_is_refused_with_the_remedy() -> None:
     lab = DriverLab()
     lab.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
-    with pytest.raises(DeviceStateError, match="Zigzag is on; switch it off"):
+    with pytest.raises(messages.ModeOn):
         lab.reactors.begin()
 
 
@@ -231,7 +233,7 @@ def test_targets_changed_by_someone_are_set_back() -> None:
         data["Thermostat"]["target"], data["Stir"]["target"] = 30.0, stir
         lab.run(3)
         assert (data["Thermostat"]["target"], data["Stir"]["target"]) == (37.0, 0.5)
-    assert sum("set back to" in row["note"] for row in lab.of("note")) == 4
+    assert len(lab.notes(messages.PutRight)) == 4
 
 
 def test_a_pump_that_no_command_reaches_is_reported() -> None:
@@ -242,7 +244,7 @@ def test_a_pump_that_no_command_reaches_is_reported() -> None:
     lab.run(3)
     assert "pump" in lab.kinds()
     assert len(lab.of("intent")) == 1
-    with pytest.raises(DeviceStateError, match="still on"):
+    with pytest.raises(PumpsNotOff):
         lab.reactors.stop()
 
 
@@ -343,7 +345,7 @@ def test_an_experiment_that_this_program_ended_is_started_again_and_one_that_som
     lab.device.submit("POST", "/Experiment/0/M0")
     lab.run(8)
     assert [t for t, path in lab.wire.posts if path == "/Experiment/1/M0"] == starts
-    assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
+    assert isinstance(lab.reactors.stations[0].book.fault, messages.EndedBySomebody)
 
 
 def test_a_stop_that_never_reached_the_device_does_not_excuse_a_later_one() -> None:
@@ -359,7 +361,7 @@ def test_a_stop_that_never_reached_the_device_does_not_excuse_a_later_one() -> N
     lab.device.submit("POST", "/Experiment/0/M0")
     lab.run(5)
     assert [path for _, path in lab.wire.posts].count("/Experiment/1/M0") == 1
-    assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
+    assert isinstance(lab.reactors.stations[0].book.fault, messages.EndedBySomebody)
 
 
 def test_the_hot_guard_switches_heating_off_for_good() -> None:

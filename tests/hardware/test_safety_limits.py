@@ -13,10 +13,12 @@ import pytest
 from envs.bench import Bench
 from hardware import memory
 from hardware.memory import Remembers
-from hardware.reactor import Fault, Measurement, Receipt, Vitals
+from hardware.messages import Fault, PumpFault, StalledFault
+from hardware.reactor import Measurement, Receipt, Vitals
 from hardware.safety.budget import FeedBudget
-from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
+from hardware.safety.config import Response, Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
+from hardware.safety.messages import PAUSES, FallsPause
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
@@ -26,12 +28,11 @@ TUBES = np.resize([20.0, 12.0, 31.0], N)  # mL, of vials that are not alike
 
 
 def told(findings: list[Finding], rows: int = N) -> list[list[str]]:
-    """Reasons of each reactor, in order; "+" after those that cool down. Every text can be written."""
+    """Reasons of each reactor, in order; "+" after those that cool down. Every fault can be made."""
     out: list[list[str]] = [[] for _ in range(rows)]
     for finding in findings:
         for i in np.flatnonzero(finding.rows):
-            assert finding.text(int(i))
-            out[i].append(finding.kind + ("+" if finding.cool is not None and finding.cool[i] else ""))
+            out[i].append(finding.of(int(i)).kind + ("+" if finding.cool is not None and finding.cool[i] else ""))
     return out
 
 
@@ -202,7 +203,6 @@ def test_the_age_of_the_newest_sample(after_s: float, driver_s: float, kind: str
         m = Measurement(np.zeros(2), np.array([0.6, 0.3]), np.zeros(2), np.ones(2, bool), vitals)
         findings = readings.check(m, np.array([fresh, True]), 1000.0 + after_s)[1]
         assert told(findings, 2) == [expected, []]
-        assert "no new sample for" in findings[0].text(0)
 
 
 # -- heat ------------------------------------------------------------------------------------------------------------
@@ -507,7 +507,7 @@ def test_after_a_fall_nothing_is_dosed_for_five_minutes_also_over_a_restart(resp
         rate, code, kinds, line = check(minute, 0.3 + 0.001 * minute)
         assert (rate, kinds) == (0.0, ("falls",))
         assert code == (Response.STOP if response == "stop" else Response.HOLD)
-        assert line == f"falls: no dose for another {8.0 - minute:.1f} min after this; no dose; {REMEDIES['falls']}"
+        assert line == f"falls: {FallsPause(minutes=8.0 - minute).sentence}; no dose; {FallsPause.remedy}"
     rate, code, kinds, line = check(8, 0.308)
     assert kinds == ()
     assert (rate, code) == ((0.0, Response.STOP) if response == "stop" else (0.01, Response.PASS))
@@ -524,11 +524,9 @@ def test_a_pause_is_not_said_of_samples_that_are_not_new_and_not_twice() -> None
 
 def test_the_worst_reason_counts_and_what_a_device_says_is_passed_on() -> None:
     _, check = one()
-    fault = Fault("stalled", "no sample", "look at it")
-    assert check(0, 0.5, fault=fault) == (
-        0.0, Response.HOLD, ("stalled",), "stalled: no sample; look at it; no dose"
-    )  # fmt: skip
-    rate, code, kinds, line = check(1, 14.0, fault=Fault("pump", "Pump1 on", "pull it"), rate=0.03)
+    found = check(0, 0.5, fault=StalledFault("no sample"))
+    assert found == (0.0, Response.HOLD, ("stalled",), "stalled: no sample; no dose")
+    rate, code, kinds, line = check(1, 14.0, fault=PumpFault("Pump1 on"), rate=0.03)
     assert (rate, code, kinds) == (0.0, Response.PUMPS_OFF, ("pump", "spectrometer", "limit"))
     assert line.count(" | ") == 2
     assert check(2, 0.5, rate=0.03)[:3] == (0.02, Response.PASS, ("limit",))
@@ -575,7 +573,7 @@ def test_a_step_is_acted_on_only_where_it_is_no_more_than_reported(jump: str, be
         ("_latched", [0.5], "_latched: .*no such code"),
         ("_latched", [5.0], "no such code"),
         ("_hold_kind", [-2.0], "_hold_kind: .*no such code"),
-        ("_hold_kind", [float(len(REMEDIES))], "no such code"),
+        ("_hold_kind", [float(len(PAUSES))], "no such code"),
         ("fed_ml", [1.0, 2.0], r"fed_ml has shape \(2,\), this run needs \(1,\)"),
         ("_dose_ml", [[0.0, 0.0]], r"_dose_ml has shape \(1, 2\), this run needs \(1, 4\)"),
     ],
@@ -624,11 +622,12 @@ def test_a_bench_of_another_period_and_cap_counts_in_its_own_doses() -> None:
     for k in range(4):
         allowed, findings = budget.check(np.array([0.02]), yes, 120.0 * k)
         budget.grant(allowed)
-    lines = ["0.02 mL/s cut to 0.006", "2.16 mL were allowed, nothing was dosed"]
-    assert (allowed[0], [f.text(0) for f in findings if f.rows[0]]) == (0.006, lines)
+    seen = [{"rate": 0.02, "most": 0.006}, {"owed_ml": pytest.approx(2.16)}]
+    assert (allowed[0], [f.of(0).fields for f in findings if f.rows[0]]) == (0.006, seen)
     budget.book(np.array([1.2]), np.array([9.0]), 480.0)
     allowed, findings = budget.check(np.array([0.006]), yes, 500.0)
-    assert [f.text(0) for f in findings if f.rows[0]] == ["0.60 mL left, 0.72 asked"]
+    left = {"left_ml": pytest.approx(0.6), "asked_ml": pytest.approx(0.72)}
+    assert [f.of(0).fields for f in findings if f.rows[0]] == [left]
     assert allowed[0] == 0.0
 
 
@@ -636,25 +635,20 @@ def test_a_reason_speaks_of_the_numbers_of_its_own_reactor() -> None:
     interlock = Interlock(4, SafetyConfig(controller_patience=1), Bench(bottle_ml=9.0))
     interlock.budget.book(np.array([8.7, 0.0, 0.0, 0.0]), np.array([40.0, 0.0, 0.0, 0.0]), -7200.0)
 
-    def lines(minute: int, od: list[float], rate: list[float], warm: list[float]) -> list[str]:
+    def found(minute: int, od: list[float], rate: list[float], warm: list[float]) -> list[Any]:
         vitals = Vitals(np.zeros(4), np.array([9000.0, 8000.0, 7000.0, 2.0]), (None,) * 4)
         m = Measurement(np.full(4, 60.0 * minute), np.array(od), np.array(warm), np.ones(4, bool), vitals)
         target = np.array([36.0, 37.0, 35.0, 34.0])
         verdict = interlock.check(m, np.array(rate), np.array([0.5, 0.6, 1.7, 0.8]), target, 60.0 * minute)
-        return [(line or "").split(";")[0] for line in verdict.reasons]
+        return [(faults[0].kind, *faults[0].fields.values()) for faults in verdict.faults]
 
-    assert lines(0, [0.6, 0.5, 0.7, 0.8], [0.01, 0.03, 0.004, 0.004], [45.1, 37.0, 35.0, 34.0]) == [
-        "hot: 45.1 degC, target 36.0: heating off",
-        "limit: 0.03 mL/s cut to 0.02",
-        "setpoint: setpoint 1.7",
-        "spectrometer: OD 0.80, raw 2: the light sensor failed",
-    ]
-    assert lines(1, [0.61, 0.71, 4.2, 0.81], [-0.02, 0.0, 0.0, 0.0], [36.0, 37.0, 35.0, 34.0]) == [
-        "controller_lost: 1 unusable proposals in a row",
-        "jump: OD 0.500 to 0.710: growth cannot do that",
-        "impossible: OD 4.200, raw 7000: outside what can be",
-        "spectrometer: OD 0.81, raw 2: the light sensor failed",
-    ]
+    assert found(0, [0.6, 0.5, 0.7, 0.8], [0.01, 0.03, 0.004, 0.004], [45.1, 37.0, 35.0, 34.0]) == [
+        ("hot", 45.1, 36.0), ("limit", 0.03, 0.02), ("setpoint", 1.7, 1.5), ("spectrometer", 0.8, 2.0)
+    ]  # fmt: skip
+    assert found(1, [0.61, 0.71, 4.2, 0.81], [-0.02, 0.0, 0.0, 0.0], [36.0, 37.0, 35.0, 34.0]) == [
+        ("controller_lost", 1.0), ("jump", 0.5, 0.71), ("impossible", 4.2, 7000.0, -0.1, 4.0),
+        ("spectrometer", 0.81, 2.0),
+    ]  # fmt: skip
     assert interlock.state()["_latched"] == [Response.REGULATE, 0.0, 0.0, 0.0]
 
 

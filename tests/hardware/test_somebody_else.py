@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from hardware.chibio.dose_sequence import AGAIN, DOSE_OFF_S
+from hardware.chibio import messages
+from hardware.chibio.dose_sequence import DOSE_OFF_S
 from hardware.errors import LinkError
 from hardware.link.transport import Reply
 from tests.hardware.driver_lab import DriverLab
@@ -62,7 +63,7 @@ def test_a_dose_from_the_web_page_is_booked_drained_and_told_once(after_s: float
         lab.run(3)
         assert lab.truth()["feed_ml"] > given + 4.0
     assert lab.truth()["volume_ml"] < 21.0
-    assert len(lab.notes("without a dose, booked as the latter: its target was changed from")) == times
+    assert len(lab.notes(messages.TargetChanged)) == times
     if after_s < 50.0:  # else it is cut, and nobody knows when
         check_booked(lab)
     check_held(lab)
@@ -77,7 +78,8 @@ def test_a_dose_from_the_web_page_that_nobody_saw_is_told_by_the_target_that_it_
     lab.step()
     send(lab, 22.0, *page, pause_s=1.5)
     lab.run(3)
-    assert len(lab.notes("Pump1 gave 0.00 to 2.62 mL without a dose")) == 1
+    [given] = lab.notes(messages.GivenWithoutDose)
+    assert (given["pump"], given["low_ml"], round(given["most_ml"], 2)) == ("Pump1", 0.0, 2.62)
     check_held(lab)
 
 
@@ -100,7 +102,7 @@ def test_what_somebody_changes_in_a_dose_is_told_as_an_interval(
     lab = lab_of(rate=1.04 / 60.0)
     upon(lab, when, after_s, path)
     lab.run(4)
-    assert bool(lab.notes("gave 0.00 to") or lab.notes("gave 1.04 to") or lab.notes("was repeated")) == told
+    assert bool(lab.notes(messages.DoseGave, messages.DoseRepeated)) == told
     check_held(lab)
     assert not FALSE_ALARMS & lab.kinds()
 
@@ -137,8 +139,7 @@ def test_a_feed_command_heard_in_a_later_dose_is_told_with_what_it_may_have_give
     lab.on_post(post)
     lab.run(5)
     assert kept[-1] == 3
-    told = lab.notes("0.62 to 1.24 mL, booked as the former: a feed command that was given up")
-    assert told or lab.notes(AGAIN)
+    assert lab.notes(messages.DosePerhapsTwice, messages.RanAgain)
     lab.run(2)
     lab.clock.sleep(15.0)
     booked_ml = float(lab.loop.interlock.budget.fed_ml[0])
@@ -177,8 +178,8 @@ def test_a_target_that_is_no_number_is_told_and_mended_in_time(pump: str, after_
     lab.step()
     send(lab, after_s, f"/SetOutputTarget/{pump}/M0/nan")
     lab.run(3)
-    assert len(lab.notes(f"{pump} was set to no number by somebody and was set to 0")) == 1
-    assert len(lab.notes("restart the device's software")) == spread
+    assert [note["item"] for note in lab.notes(messages.PutRight)] == [pump]
+    assert len(lab.notes(messages.DumpWillFail)) == spread
     assert lab.device.apps["M0"].data[pump]["target"] == (0.0 if pump != "Pump1" else pytest.approx(0.0086, abs=1e-3))
     assert lab.of("fault") == []
     check_held(lab)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf.messages import Message
 from envs.bench import Bench
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
@@ -26,13 +27,15 @@ from hardware.emulator.family import _words
 from hardware.errors import DeviceStateError, RecordingError, UnfitError
 from hardware.family import Opening
 from hardware.logbook import Logbook
+from hardware.messages import LinkFault, NoNewSample, OpenDose, PumpsNotOff
 from hardware.pioreactor import family as pioreactor
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.reactor import Command, Fault
+from hardware.reactor import Command
 from hardware.simulated import FAMILY, SimulatedConfig, SimulatedReactors
 from hardware.stations import Newest, Stations
 from hardware.storage.doses import Given
 from hardware.storage.journal import Journal
+from hardware.storage.messages import JournalMissing
 
 NAN = math.nan
 
@@ -62,7 +65,7 @@ class One:
     def dose(self, rate: float, number: int) -> SimpleNamespace:
         self.asked.append(("dose", rate, number))
         self.doses.carry_ml += 0.01 * number
-        self.book.tell(f"pump {number}")
+        self.book.tell(Message(f"pump {number}"))
         return SimpleNamespace(feed_ml=60.0 * rate, waste_ml=200.0 * rate)
 
     def regulate(self, setpoint: float) -> None:
@@ -162,7 +165,7 @@ def test_without_a_sample_measure_returns_when_the_newest_is_stale_and_every_20_
         lab.measure()
         returned.append(lab.clock.now())
     assert returned == pytest.approx([180.0, 200.0, 220.0], abs=0.6)
-    lab.stations[2].book.report(Fault("link", "no answer", "look"))
+    lab.stations[2].book.report(LinkFault("no answer"))
     m = lab.measure()
     assert lab.clock.now() == returned[-1]  # a fault that appears is told at once, and once
     assert [fault and fault.kind for fault in m.vitals.faults] == [None, None, "link"]  # type: ignore[union-attr]
@@ -184,8 +187,9 @@ def test_a_stop_leaves_who_was_handed_over_and_says_whose_pumps_it_could_not_ver
     lab.begin(elapsed_s=600.0)
     lab.stations[0].handed_over = True
     lab.stations[2].fails = "Pump1 still on"
-    with pytest.raises(DeviceStateError, match=r"^M5: Pump1 still on$"):
+    with pytest.raises(PumpsNotOff) as error:
         lab.stop()
+    assert error.value.fields == {"failed": "M5: Pump1 still on"}
     assert lab.silenced == ["M3", "M5"]
     (row,) = lab.rows
     assert row == {
@@ -209,16 +213,20 @@ def test_what_a_logbook_tells_shows_and_reports(caplog: pytest.LogCaptureFixture
     rows: list[tuple[str, Any]] = []
     book = Logbook("M4", lambda kind, fields: rows.append((kind, fields)), lambda *_: None, lambda: 0.0)
     with caplog.at_level(logging.INFO):
-        book.tell("cut to the limit")
-        book.say("waits 70 s")
-    assert book.notes == ["cut to the limit"]
-    assert [record.getMessage() for record in caplog.records] == ["M4: waits 70 s"]
-    assert [fields["note"] for _, fields in rows] == ["cut to the limit", "waits 70 s"]
-    for fault, news in ((None, False), (Fault("link", "a", "b"), True), (Fault("link", "c", "d"), False), (None, True)):
+        book.tell(note := NoNewSample())
+        book.say(wait := OpenDose(ml=1.0))
+    assert book.notes == [note]
+    assert [record.getMessage() for record in caplog.records] == [f"M4: {wait}"]
+    assert [fields["note"] for _, fields in rows] == [str(note), str(wait)]
+    assert [(fields["name"], fields["fields"]) for _, fields in rows] == [
+        ("NoNewSample", {}),
+        ("OpenDose", {"ml": 1.0}),
+    ]
+    for fault, news in ((None, False), (LinkFault("a"), True), (LinkFault("c"), False), (None, True)):
         book.news = False
         book.report(fault)
         assert (book.news, book.fault) == (news, fault)
-    assert [fields["fault"] for kind, fields in rows if kind == "fault"] == ["link: a; b", None]
+    assert [fields["fault"] for kind, fields in rows if kind == "fault"] == ["link: a", None]
 
 
 # -- opened for a run --------------------------------------------------------------------------------------------------
@@ -283,7 +291,7 @@ def test_a_fast_device_s_run_goes_on_by_its_time(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_resumed_run_without_its_journal_is_not_a_new_one(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="missing or empty; put it back, or start a new run"):
+    with pytest.raises(JournalMissing):
         opening(tmp_path, ChiBioConfig()).earlier()
     assert opening(tmp_path, ChiBioConfig(), resumed=False).earlier() == []
 

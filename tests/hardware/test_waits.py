@@ -1,14 +1,17 @@
 """No wait of the driver is without an end and a word: a flag that stays, a start that fails, a link that is silent."""
 
 import logging
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hardware.chibio import messages
 from hardware.clock import VirtualClock
-from hardware.errors import DeviceStateError, LinkError
+from hardware.errors import LinkError
 from hardware.link.transport import Reply, SharedLink, Transport
+from hardware.messages import NotLeftOff
 from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.emulator_lab import quiet
 
@@ -45,7 +48,7 @@ def test_a_dead_thread_costs_one_restart_neither_heat_nor_stirring_and_the_neigh
     data = lab.device.apps["M0"].data
     assert [data[item]["ON"] for item in ("Thermostat", "Stir", "Experiment")] == [1, 1, 1]
     assert lab.truth("M0")["temperature"] > 36.0
-    assert lab.notes("restarted after: stalled")
+    assert lab.notes(messages.RestartedAfter) == [{"kind": "stalled"}]
 
 
 def test_a_running_experiment_that_measures_for_ever_is_started_anew(caplog: pytest.LogCaptureFixture) -> None:
@@ -57,7 +60,7 @@ def test_a_running_experiment_that_measures_for_ever_is_started_anew(caplog: pyt
     began = lab.clock.now()
     lab.reactors.begin()
     assert 90.0 <= lab.clock.now() - began < 120.0
-    assert "M0: the device has measured for 20 s, which is too long: started anew" in caplog.text
+    assert f"M0: {messages.MeasuresTooLong(seconds=20.0)}" in caplog.text
     lab.run(3)
     assert lab.samples[0] >= 2
     assert "stalled" not in lab.kinds()
@@ -67,7 +70,7 @@ def test_a_restart_that_brings_no_sample_is_said_and_tried_again() -> None:
     lab = begun(options=quiet(mu=0.025), minutes=3)
     lab.fault("internal_zero", 2)
     lab.run(20)
-    assert lab.notes("the restart before brought no sample, attempt 2 follows")
+    assert lab.notes(messages.RestartedAgain)[0] == {"attempt": 2}
     assert lab.steps[-1].reasons[0] is None
     assert lab.samples[0] >= 8
 
@@ -82,8 +85,7 @@ def test_a_start_that_the_device_does_not_take_is_said_and_tried_again(monkeypat
 
     monkeypatch.setattr(lab.wire.inner, "post", post)
     lab.run(15)
-    said = lab.notes("could not be restarted after")
-    assert "the experiment does not start; look at the device's terminal" in said[0]
+    assert lab.notes(messages.NotRestarted)[0]["error"] == messages.DoesNotStart(reactor="M0").row
     assert lab.samples[1] > lab.samples[0] + 8
     deaf["on"] = False
     before = lab.samples[0]
@@ -146,7 +148,7 @@ def test_a_resumed_run_goes_on_with_the_others_while_one_is_absent(caplog: pytes
     lab.device.computer.events.remove("M1/Experiment")
     lab.device.computer.events.remove("M1/Thermostat")
     lab.resume()
-    assert "M1: not taken over, the others go on and this one is tried again" in caplog.text
+    assert len(lab.notes(messages.NotTakenOver)) == 1
     before, fed = lab.samples.copy(), [lab.truth(m)["feed_ml"] for m in ("M0", "M2")]
     lab.run(3)
     assert (lab.samples[[0, 2]] >= before[[0, 2]] + 2).all()
@@ -171,9 +173,10 @@ def test_a_resumed_run_whose_reactors_are_all_out_of_reach_ends_with_what_it_cou
         return real(path)
 
     lab.on_post(post)
-    why = "stopped" if stopped else "no answer"
-    with pytest.raises(DeviceStateError, match=rf"{why}.*pumps not verified off: M0: .*; M1: .*by hand now"):
+    with pytest.raises(NotLeftOff) as error:
         lab.resume()
+    assert ("stopped" if stopped else "no answer") in error.value.fields["why"]
+    assert re.search("M0: .*; M1: ", error.value.fields["failed"].fields["failed"])
 
 
 # -- a stop at the start -----------------------------------------------------------------------------------------------

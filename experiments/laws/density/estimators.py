@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple, Protocol
 
+from conf.messages import NameTaken, NotAllowed
 from envs.task import EnvConfig
 from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
 from experiments.laws.density.estimator import Estimator, EstimatorConfig, fixed
@@ -92,14 +93,14 @@ def add(
     Raises: ValueError for a kind that exists.
     """
     if kind in KINDS:
-        raise ValueError(f"estimator {kind}: there is one of this name already; choose another")
+        raise NameTaken(what="estimator", name=kind)
     KINDS[kind] = EstimatorKind(config, make, fixed)
 
 
 def config_at(kind: str, key: str = "controller.estimator") -> Any:
     """Return the default config of an estimator, "": kalman. Raises: ValueError with the known kinds."""
     if (kind or "kalman") not in KINDS:
-        raise ValueError(f"{key}.kind = {kind}: allowed {', '.join(KINDS)}")
+        raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(KINDS))
     return KINDS[kind or "kalman"].config()
 
 

@@ -1,0 +1,69 @@
+"""What every kind of reactor may tell of itself or its link: faults, and notes on doses."""
+
+import re
+from typing import ClassVar
+
+from conf.messages import Message
+from hardware.errors import DeviceStateError
+
+
+class Fault(Message):
+    """Something wrong with one reactor: which kind, what was seen, what helps.
+
+    Attributes: response, what the interlock does about it, a word of `hardware.safety.config.WORDS`; kind, by which
+      settings and records name it: the class that declares the response, with underscores and without "Fault".
+    """
+
+    kind: ClassVar[str] = ""
+    response: ClassVar[str] = ""
+
+    def __init_subclass__(cls, response: str = "", **words: str) -> None:
+        super().__init_subclass__(**words)
+        if response:
+            cls.response = response
+            cls.kind = re.sub(r"\B([A-Z])", r"_\1", cls.__name__.removesuffix("Fault")).lower()
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {super().__str__()}"
+
+    def line(self, done: str) -> str:
+        """Say it with what was done about it."""
+        return f"{self.kind}: " + "; ".join(filter(None, (self.sentence, done, self.remedy)))
+
+
+# fmt: off
+
+class LinkFault(Fault, response="hold"): ...
+class SelectionFault(Fault, response="hold"): ...
+class IdentityFault(Fault, response="stop"): ...
+class AbsentFault(Fault, response="hold"): ...
+class RestartedFault(Fault, response="hold"): ...
+class StoppedFault(Fault, response="pumps_off"): ...
+class StalledFault(Fault, response="hold"): ...
+class ModeFault(Fault, response="hold"): ...
+class BlankFault(Fault, response="hold"): ...
+class PumpFault(Fault, response="pumps_off"): ...
+class OverflowPumpFault(Fault, response="hold"): ...
+class UndosedFault(Fault, response="report"): ...
+class NoDose(Message, says="no dose: {why}"):
+    """Nothing was begun for this sample; the culture grows undiluted."""
+class NoNewSample(Message, says="no new sample"):
+    """The sample was answered already, or none came yet."""
+class DoseUnderWay(Message, says="the previous dose has not ended"):
+    """Its pumps are not yet verified off; if that stays, see the fault of kind pump."""
+class OpenDose(Message, says="an earlier life of the program left a dose of {ml:.2f} mL open",
+    remedy="look at the level and at the bottle"):
+    """The program died in a dose; the next note says what it gave, if not what was planned."""
+class NotLeftOff(DeviceStateError, says="{why}; {failed}"): ...
+class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
+    remedy="pull the plug of the pump boards now"): ...
+class PreflightFailed(DeviceStateError, says="preflight: {count} of {of} checks failed, the first: {first}"): ...
+class PumpsNotLookedAt(Message, says="stopped before the pumps were looked at: pumps not verified off",
+    remedy="look at the pumps, resume the run"):
+    """An earlier life of the run may have left a pump on."""
+class ClockMoved(Message, says="this computer's clock moved by {by_min:.1f} min since the run's last row: "
+    "the run goes on at minute {minute:.1f}, without that step", remedy="set its clock right, look at its battery"):
+    """The clock was set while no program ran; the run counts by the device's cycles and a clock that nobody sets."""
+class ClockDoubtful(Message, says="how long no program ran is known by this computer's clock alone, which may be wrong",
+    remedy="compare the minute in the next line with a watch"):
+    """Computer and device were both started anew."""

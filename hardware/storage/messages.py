@@ -1,0 +1,24 @@
+"""What the files of a run say when they cannot be written or read; it ends a run, pumps verified off, or a resume."""
+
+from conf.messages import Message
+from hardware.errors import RecordingError
+
+# fmt: off
+
+class NotWritten(RecordingError, says="{path}: {why}", remedy="free disk space, then resume the run"):
+    """The disk is full or gone; the run ends."""
+class NotOpened(RecordingError, says="{path}: {why}", remedy="check folder, rights and disk"): ...
+class JournalTaken(RecordingError, says="journal {path}: another program writes this run", remedy="end that first"):
+    """Two programs would write one run; nothing was changed."""
+class JournalMissing(RecordingError, says="journal {path}: missing or empty",
+    remedy="restore it or start a new run"): ...
+class RowDamaged(RecordingError, says="{path}: {what}",
+    remedy="the file was changed by hand: put it back as the run wrote it, or start a new run"): ...
+class NotRecording(RecordingError, says="{path}: {why}", remedy="{help}"):
+    """Another file lies in the recording's place; not resumed."""
+class WrongRow(RecordingError, says="{path}: row lacks columns {missing} and has unknown columns {unknown}",
+    remedy="report it"):
+    """An error in the program; the run ends."""
+class MarksDamaged(RecordingError, says="{path}: damaged ({why})", remedy="mend it or move it away"): ...
+class TornLine(Message, says="{path}: cut a torn last line of {length} bytes"):
+    """A kill or a power cut while a row was written; nothing else is lost."""
