@@ -155,6 +155,7 @@ def lived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     @cache
     def typed(shown: str) -> Path:
         folder = tmp_path_factory.mktemp("reader")
+        shutil.copy(ROOT / "experiments" / "data" / "open_loop.csv", folder / "YOURS.csv")
         if earlier := before(shown):
             shutil.copytree(typed(earlier), folder, dirs_exist_ok=True)
         plain = {"WITHOUT_FIGURES": "1"} if shown in QUICK else {}

@@ -82,7 +82,7 @@ assert (policies.load(Path("policy.npz")).act(seen) == theirs).mean() > 0.995
 
 @pytest.mark.slow
 def test_an_agent_of_ones_own_trains_and_its_policy_pumps(folder: Path) -> None:
-    train, deploy = (shlex.split(c)[2:] for c in COMMANDS if re.search("ppo|policy=latest", c))
+    train, deploy = (shlex.split(c)[2:] for c in COMMANDS if re.search("ppo|deploy policy=latest", c))
     done = run([*train, "agent.total_steps=430", "agent.horizon=70", "hydra.run.dir=runs/train/here"], folder)
     assert done.returncode == 0, done.stderr
     found = summary(folder)
@@ -174,9 +174,9 @@ def test_a_task_with_a_config_of_its_own_trains(tmp_path: Path) -> None:
         (
             "mine.py",
             "from experiments.laws import registry\nregistry.add('pi', int, int, 'x')\n",
-            "mine.py:2: ValueError: controller = pi",
+            "mine.py:2: NameTaken: ",
         ),
-        ("mine.py", "from envs.plant import disturbance\ndisturbance.add('', print)\n", "mine.py:2: ValueError: "),
+        ("mine.py", "from envs.plant import disturbance\ndisturbance.add('', print)\n", "mine.py:2: NotAllowed: "),
         ("mine.yaml", "setpoint: [0.5]\n", "scenario.setpoint"),
         ("mine.yaml", "[1, 2]\n", "scenario="),
         ("mine.yaml", "a: [\n", "scenario="),

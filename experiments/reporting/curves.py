@@ -61,6 +61,7 @@ CURVES = {
     "controller/growth_share": Curve("", "growth share, input of the policy"),
     "controller/supervised": Curve("", "1 if the supervisor's controller acts in place of the policy"),
     "controller/alarm": Curve("", "1 if it acts because innovations do not fit the estimate"),
+    "controller/noted": Curve("", "1 if readings are far louder than the estimator expects"),
     "controller/error_sd": Curve("periods of full pump", "standard deviation of that error"),
     "controller/growth_share_sd": Curve("", "standard deviation of that growth share"),
     "controller/true_error": Curve("periods of full pump", "true error, in a simulation"),

@@ -268,7 +268,7 @@ def test_a_vial_that_does_not_warm_up_gets_no_blank(tmp_path: Path) -> None:
     words = ["--speed", "600", "--od", "0", "--unblanked", "--temperature", "20"]
     with EmulatorProcess(words) as emulator:
         backend = ChiBioConfig(url=emulator.url, speed=600.0, calibration=str(tmp_path))
-        with pytest.raises(frame.UserError, match=r"M0: .*degC after [56] min, wanted 37 \+- 1; check heater and lid"):
+        with pytest.raises(frame.UserError, match=r"M0: .* after [56] min, .*37"):
             blank(BlankConfig(backend, samples=3, warm_up=5.0), tmp_path)
     assert not list(tmp_path.glob("*blank.yaml"))
 

@@ -471,7 +471,7 @@ def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_s
 def test_a_policy_that_is_none_or_says_no_model_ends_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no such file; give the policy\.npz"):
         command.body(CertifyConfig(policy=str(tmp_path / "none.npz")), tmp_path)
-    with pytest.raises(UserError, match="^policy is empty: give policy=latest, shipped, a run folder or a policy"):
+    with pytest.raises(UserError, match="^policy is empty"):
         command.body(CertifyConfig(policy=""), tmp_path)
     given = laws.law()
     policy.save(tmp_path / "policy.npz", replace(given, metadata={**given.metadata, "model": {}}))

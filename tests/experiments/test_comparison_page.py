@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from experiments.coculture import comparison
 from experiments.comparison import figures, page, studies
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
@@ -419,4 +420,4 @@ def test_a_page_says_how_much_was_run_and_has_the_words_of_its_own_signal(tmp_pa
     [(_, said)] = sections["In short"]
     assert said["items"] == ["steps on one: pi 0.03, then midpoint 0.04"]
     [(_, words)] = sections["Definitions"]
-    assert [term for term, _ in words["pairs"]] == list(page.SHARE)
+    assert [term for term, _ in words["pairs"]] == list(comparison.DEFINITIONS)

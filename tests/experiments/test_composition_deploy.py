@@ -13,6 +13,7 @@ import yaml
 
 from experiments import report
 from experiments.cli import frame
+from experiments.coculture import run as coculture_run
 from experiments.coculture.config import read_pair
 from experiments.coculture.policies import SHIPPED_COMPOSITION
 from experiments.coculture.signal import COLUMNS
@@ -231,7 +232,7 @@ def test_another_pair_lives_in_the_vials_and_within_its_own_limits(tmp_path: Pat
     )  # fmt: skip
     config = yaml.safe_load((folder / "config.yaml").read_text())
     pair.unlink()  # a run keeps its own, also for a resume
-    again = assemble.with_pair(replace(main.config([f"pair={pair}"]), resume=str(folder)), folder)
+    again = coculture_run._with_pair(replace(main.config([f"pair={pair}"]), resume=str(folder)), folder)
     assert again.pair == str(folder / "pair.yaml")
     kept = read_pair(again.pair)
     assert config["plant"]["pair"]["second"]["name"] == kept.second.name == "beta"

@@ -17,9 +17,9 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
+from experiments.coculture import run as coculture_run
 from experiments.coculture.base import SHARE
 from experiments.coculture.signal import Share
-from experiments.control import assemble
 from experiments.control.run import BenchMarks
 from experiments.laws import registry
 from experiments.record.recovery import COLUMNS as USUAL
@@ -119,7 +119,7 @@ def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
 
 def test_what_the_device_dosed_while_the_program_was_dead_is_told(tmp_path, monkeypatch):
     """A pump left on repeats its dose; the estimate's dilution is the interlock's account of it."""
-    monkeypatch.setattr(assemble, "_share", lambda config, plant, folder, scenarios: share(scenarios))
+    monkeypatch.setattr(coculture_run, "_share", lambda config, plant, folder, scenarios: share(scenarios))
     run = rehearsal(tmp_path, SHORT)
     run.begin()
     run.kill_at("/SetOutputOn/Pump1/1/M0", lambda: run.clock.now() > 1800.0, 0.3)

@@ -146,7 +146,7 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
         (b"", "it has no backend"),
         (b"7\n", "Invalid loaded object type: int"),
         (b"[1]\n", "it holds no keys and values"),
-        (b"a: [", "while parsing a flow node"),
+        (b"a: [", "in line 1"),
         (b"a: *x\n", "an alias or interpolation in line 1"),
         (b"\xff\xfe\0\1", "no UTF-8 text"),
         (b"backend: x\n", "backend = x: allowed keys and values"),

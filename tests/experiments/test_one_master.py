@@ -14,7 +14,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
 from hardware.chibio.messages import WrongStatus
 from hardware.emulator.process import EmulatorProcess
-from hardware.errors import DeviceStateError
+from hardware.link.messages import DeviceTaken
 from tests.programs import Program, run
 
 
@@ -24,7 +24,7 @@ def test_a_second_master_is_refused_under_another_name_of_the_device(
     with EmulatorProcess(["--speed", "100", "--reactors", "M1,M2"]) as device:
         by_number = ChiBioConfig(url=device.url, speed=100.0, reactors=("M1",))
         by_name = ChiBioConfig(url=device.url.replace("127.0.0.1", "localhost"), speed=100.0, reactors=("M2",))
-        refusal = pytest.raises(DeviceStateError, match=f"already controlled by process {os.getpid()}: one client per")
+        refusal = pytest.raises(DeviceTaken, match=f"process {os.getpid()}")
         with linked(by_number), refusal:
             monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # as of another user
             linked(by_name).__enter__()

@@ -309,7 +309,7 @@ def test_three_strains_on_three_pumps_are_held_without_a_calibration(tmp_path: P
         tmp_path, rehearsed(("M0", "M1", "M2"), schedule), DeviceOptions(plant=plant_preset("mixed")), od=0.45
     )
     vials = [vial.plant for vial in run.device.vials.values()]
-    growth = [float(v.culture.draws["mu"][0]) for v in vials]
+    growth = [float(v.draws["mu"][0]) for v in vials]
     flow = [float(v.feed.draws["pump_gain_ml_s"][0]) for v in vials]
     assert max(growth) / min(growth) > 1.15
     assert max(flow) / min(flow) > 1.3
