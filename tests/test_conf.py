@@ -355,6 +355,16 @@ def test_a_file_of_one_s_own_stands_anywhere_among_the_presets_of_a_sweep(order,
     assert presets.load("agent/mine") == {"hidden": [8]}
 
 
+@pytest.mark.parametrize("command", [main, deploy])
+def test_a_folder_that_holds_a_run_takes_no_other_one(command, tmp_path, monkeypatch):
+    """Else a second run would be appended to the recordings of the first."""
+    monkeypatch.setattr(frame.EntryPoint, "_hydra", lambda command: pytest.fail("it began"))
+    (tmp_path / command.resumes).write_text("{}")
+    with pytest.raises(frame.UserError, match="resume="):
+        command._answer([f"hydra.run.dir={tmp_path}"])
+    assert [path.name for path in tmp_path.iterdir()] == [command.resumes]
+
+
 @pytest.mark.parametrize("where", [0, 1, 2])
 def test_a_value_beside_resume_is_refused_wherever_it_is_typed(where, tmp_path, monkeypatch):
     """What Hydra is told, and nothing else, stands beside it."""

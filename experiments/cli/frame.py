@@ -251,6 +251,9 @@ class EntryPoint(Generic[T]):
             others = [a for a in given if not a.startswith(("resume=", "hydra."))]
             if resumed and others:
                 raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
+            for taken in [a.removeprefix(words.RUN) for a in given if a.startswith(words.RUN)]:
+                if self.resumes and not resumed and (Path(taken) / self.resumes).is_file():
+                    raise UserError(f"{words.RUN}{taken}: holds a run; continue it by resume={taken}, or name another")
         self._hydra()
 
     def _hydra(self) -> None:
