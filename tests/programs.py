@@ -139,8 +139,9 @@ class Program:
 
     def send_signal(self, number: int) -> None:
         """To the program alone."""
-        if self.poll() is None:
-            os.kill(self.pid, number)
+        with suppress(ProcessLookupError):  # its server may have collected it since
+            if self.poll() is None:
+                os.kill(self.pid, number)
 
     def terminate(self) -> None:
         """SIGTERM."""
