@@ -41,6 +41,7 @@ from experiments.record.record import Recordings
 from experiments.record.summary import figure_of
 from experiments.reporting import calibration_charts, charts, sweep_charts
 from experiments.reporting.calibration_charts import agreement_figure
+from experiments.reporting.charts import COLOURS
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 
@@ -51,6 +52,7 @@ LATER = MINUTES + 5.0
 OD = np.linspace(0.3, 0.52, 12)
 RATE = np.where(np.arange(12) % 3 == 0, 0.004, 0.012)  # mL/s
 SPREAD = np.array([-0.02, 0.0, 0.02])[:, None]  # sd 0.02, variance 0.0004
+STYLES = {"line": "default", "step": "steps-post", "pre": "steps-pre"}
 
 
 def label(ax: Axes, axis: str) -> str:
@@ -73,18 +75,26 @@ def estimate(ax: Axes, low: float, high: float) -> tuple[float, float]:
 
 
 def read(ax: Axes, what: str) -> tuple[Any, Any]:
-    """x and y of the so-manyth line, band (low, high) or bar (value, low, high) of a panel."""
+    """x and y of the so-manyth line, band (low, high) or bar (value, low, high) of a panel.
+
+    What holds until the next row is drawn as a step over the time after its own, an episode's decision before it. A
+    line may have a name, which is that of the legend.
+    """
+    what, _, name = what.partition(": ")
     kind, *k = what.split()
     if kind == "row":
         return estimate(ax, *map(float, k))
     if k[:1] == ["announced"]:
         k = [[str(i) for i, line in enumerate(ax.lines) if line.get_marker() == ">"][int(k[1])]]
     k = k[0] if k else "0"
-    if kind == "line":
-        x, y = ax.lines[int(k)].get_data()
+    if kind in STYLES:
+        line = ax.lines[int(k)]
+        assert (line.get_drawstyle(), name or line.get_label()) == (STYLES[kind], line.get_label())
+        x, y = line.get_data()
         return np.asarray(x, float), np.asarray(y, float)
     if kind == "band":
         band = [c for c in ax.collections if isinstance(c, PolyCollection)][int(k)]
+        assert name in ("", band.get_label())
         corners = band.get_paths()[0].vertices
         x = np.unique(corners[:, 0])
         ends = [[f(corners[np.isclose(corners[:, 0], at), 1]) for at in x] for f in (np.min, np.max)]
@@ -222,16 +232,6 @@ def proven(share: bool) -> Certificate:
 
 
 @cache
-def certificate(share: bool) -> Figure:
-    return certificate_figure(proven(share))
-
-
-def middle(share: bool) -> Any:
-    loop = proven(share).question.loop
-    return (loop.low + loop.high) / 2.0
-
-
-@cache
 def two() -> Figure:
     """E. coli by its published line, and a point that is longer to one side."""
     points = (
@@ -264,8 +264,9 @@ def learning(agents: int) -> Figure:
 
 
 def episodes() -> Figure:
-    columns = ([[0.4], [0.5]], [[0.2], [0.3]], [[0.1], [0.15]], [[30.0], [31.0]], [[33.0], [34.0]])
-    return composition_charts.episodes(np.array([1.0, 2.0]), *map(np.array, columns), "B. subtilis")
+    wanted = WANTED.T
+    shares = wanted, wanted - 0.1, wanted - 0.2
+    return composition_charts.episodes(np.array([1.0, 2.0]), *shares, 30.0 + wanted, 33.0 + wanted, "B. subtilis")
 
 
 def compared_laws() -> Figure:
@@ -286,38 +287,42 @@ WARMTH = np.linspace(29.0, 36.0, 141)
 FED, TWICE = [4, 12, 12] * 4, [8, 24, 24] * 4
 ONES, TENS = np.arange(90.0), np.arange(4.5, 400.0, 10.0)
 STEPS = [100.0, 200.0]
+REGRET = "regret against the optimum, %"
+WANTED = np.array([[0.4, 0.5], [0.7, 0.6]])
 
 Drawn = tuple[int, str, str, str, Any, Any]
 DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
     "closed loop": (closed_loop, [
-        (0, "line 0", H, "OD", HOURS, OD),
-        (0, "line 1", H, "OD", HOURS, np.full(12, 0.45)),
-        (0, "line 2", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
-        (0, "line 3", H, "OD", LATER / 60, np.full(12, 0.9)),
+        (0, "line 0: M0", H, "OD", HOURS, OD),
+        (0, "step 1: setpoint", H, "OD", HOURS, np.full(12, 0.45)),
+        (0, "line 2: M1", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
+        (0, "step 3", H, "OD", LATER / 60, np.full(12, 0.9)),
         (0, "line 4", H, "OD", [0.75, 0.75], [0, 1]),
+        (0, "line 5: not believed", H, "OD", HOURS, np.full(12, np.nan)),
         (0, "line 6", H, "OD", LATER / 60, np.where(MINUTES == 90.0, 2 * OD, np.nan)),
-        (1, "line 0", H, PUMP, HOURS, FED),
-        (1, "line 1", H, PUMP, LATER / 60, TWICE),
+        (1, "step 0", H, PUMP, HOURS, FED),
+        (1, "step 1", H, PUMP, LATER / 60, TWICE),
         (2, "line 0", H, WARM, HOURS, 37 - HOURS),
         (2, "line 1", H, WARM, LATER / 60, 74 - 2 * HOURS),
     ]),
     "composition": (composition, [
-        (0, "line 0", H, "share of B", HOURS, OD),
+        (0, "line 0: M0, estimate and 95 % band", H, "share of B", HOURS, OD),
+        (0, "step 1: setpoint", H, "share of B", HOURS, np.full(12, 0.4)),
+        (0, "line announced 0: next setpoint, when announced", H, "share of B", [2.0], [0.7]),
         (0, "band 0", H, "share of B", HOURS, [OD - 0.1, OD + 0.2]),
         (0, "band 1", H, "share of B", LATER / 60, [2 * OD - 0.2, 2 * OD + 0.4]),
         (0, "bar 0", H, "share of B", [1.0], [[0.3], [0.3 - 1.96 * 0.02], [0.3 + 1.96 * 0.02]]),
         (0, "bar 1", H, "share of B", [2.0], [[0.6], [0.6 - 1.96 * 0.05], [0.6 + 1.96 * 0.05]]),
-        (0, "line announced 0", H, "share of B", [2.0], [0.7]),
         (0, "line announced 1", H, "share of B", [65 / 60], [0.9]),
         (1, "line 0", H, WARM, HOURS, 37 - HOURS),
-        (1, "line 1", H, WARM, HOURS, 36 - HOURS),
+        (1, "step 1", H, WARM, HOURS, 36 - HOURS),
         (1, "line 2", H, WARM, LATER / 60, 74 - 2 * HOURS),
-        (1, "line 3", H, WARM, LATER / 60, 72 - 2 * HOURS),
+        (1, "step 3", H, WARM, LATER / 60, 72 - 2 * HOURS),
         (2, "line 0", H, "OD", HOURS, OD),
         (2, "line 2", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
-        (2, "line 3", H, "OD", LATER / 60, np.full(12, 0.9)),
-        (3, "line 0", H, PUMP, HOURS, FED),
-        (3, "line 1", H, PUMP, LATER / 60, TWICE),
+        (2, "step 3", H, "OD", LATER / 60, np.full(12, 0.9)),
+        (3, "step 0", H, PUMP, HOURS, FED),
+        (3, "step 1", H, PUMP, LATER / 60, TWICE),
         (4, "line 0", H, "fluorescence, counts", HOURS, 1000 * OD),
         (4, "line 1", H, "fluorescence, counts", LATER / 60, 2000 * OD),
     ]),
@@ -335,7 +340,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (0, "line 0", H, "OD", INSIDE, OD[2:9]),
         (0, "line -1", H, "OD", INSIDE, OD[2:9] - 0.01),
         (1, "line 1", H, "innovation, predicted sd", INSIDE, np.linspace(-2.0, 2.0, 7)),
-        (2, "line 0", H, PUMP, HOURS, FED),
+        (2, "step 0", H, PUMP, HOURS, FED),
     ]),
     "fit of a free run": (lambda: fit("free_run"), [
         (0, "line -1", H, "OD", INSIDE, OD[2:9] + 0.02),
@@ -364,29 +369,29 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (1, "stick", SORTED, "dilution constant τ over its truth", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
     ]),
     "pair": (two, [
-        (0, "line 0", WARM, "growth rate, 1/h", WARMTH, 0.07727 * WARMTH - 1.66954),
-        (0, "line 4", WARM, "growth rate, 1/h", WARMTH, -0.02208 * WARMTH**2 + 1.3796 * WARMTH - 20.56996),
+        (0, "line 0: E. coli", WARM, "growth rate, 1/h", WARMTH, 0.07727 * WARMTH - 1.66954),
+        (0, "line 4: P. putida", WARM, "growth rate, 1/h", WARMTH, -0.02208 * WARMTH**2 + 1.3796 * WARMTH - 20.56996),
         (0, "bar 0", WARM, "growth rate, 1/h", [30.0], [[0.6], [0.5], [0.9]]),
         (0, "bar 1", WARM, "growth rate, 1/h", [34.0], [[0.8], [0.75], [1.0]]),
         (1, "line 0", WARM, "pigment, counts per hour and OD", WARMTH, PairConfig().production(WARMTH)),
     ]),
     "learning": (lambda: learning(1), [
         (0, "line 0", "episode", "cost of the episode, sum of (x − setpoint)²", [1, 2], [0.2, 30.0]),
-        (1, "line 0", "environment step", "regret against the optimum, %", STEPS, [4.0, 0.5]),
-        (1, "line 1", "environment step", "regret against the optimum, %", [200.0, 200.0], [0.0, 1.0]),
+        (1, "line 0: greedy policy", "environment step", REGRET, STEPS, [4.0, 0.5]),
+        (1, "line 1: policy kept", "environment step", REGRET, [200.0, 200.0], [0.0, 1.0]),
     ]),
     "learning of five": (lambda: learning(5), [
         (0, "line 0", "episode", "cost of the episode, sum of (x − setpoint)²", [1, 2], [2.2, 32.0]),
-        (1, "line 0", "environment step", "regret against the optimum, %", STEPS, [6.0, 2.5]),
-        (1, "band 0", "environment step", "regret against the optimum, %", STEPS, [[4.0, 0.5], [8.0, 4.5]]),
-        (1, "band 1", "environment step", "regret against the optimum, %", STEPS, [[5.0, 1.5], [7.0, 3.5]]),
+        (1, "line 0: greedy policy, median", "environment step", REGRET, STEPS, [6.0, 2.5]),
+        (1, "band 0: range of 5 seeds", "environment step", REGRET, STEPS, [[4.0, 0.5], [8.0, 4.5]]),
+        (1, "band 1: middle half", "environment step", REGRET, STEPS, [[5.0, 1.5], [7.0, 3.5]]),
     ]),
     "episodes": (episodes, [
-        (0, "line 0", "hours", "share of B. subtilis", [1, 2], [0.4, 0.5]),
-        (0, "line 1", "hours", "share of B. subtilis", [1, 2], [0.2, 0.3]),
-        (0, "line 2", "hours", "share of B. subtilis", [1, 2], [0.1, 0.15]),
-        (1, "line 0", "hours", "thermostat, °C", [1, 2], [30.0, 31.0]),
-        (1, "line 1", "hours", "thermostat, °C", [1, 2], [33.0, 34.0]),
+        *((k, "pre 0: setpoint", "hours", "share of B. subtilis", [1, 2], WANTED[k]) for k in (0, 1)),
+        *((k, "line 1: learned", "hours", "share of B. subtilis", [1, 2], WANTED[k] - 0.1) for k in (0, 1)),
+        *((k, "line 2: optimum", "hours", "share of B. subtilis", [1, 2], WANTED[k] - 0.2) for k in (0, 1)),
+        *((2 + k, "pre 0", "hours", "thermostat, °C", [1, 2], 30.0 + WANTED[k]) for k in (0, 1)),
+        *((2 + k, "pre 1", "hours", "thermostat, °C", [1, 2], 33.0 + WANTED[k]) for k in (0, 1)),
     ]),
     "bands": (lambda: figures.bands([trial(90.0)]), [
         (0, "line 1", MIN, "OD", ONES, np.full(90, 0.5)),
@@ -427,9 +432,11 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
     ]),
     "curves of a sweep": (lambda: sweep_charts.learning_curves(
-        [("a", np.array(STEPS), np.array([[9.0, 4.0, 5.0, 6.0], [1.0, 2.0, 8.0, 3.0]]))], "regret, %"), [
-        (0, "line 0", "environment step", "regret, %", STEPS, [5.5, 2.5]),
+        [("a", np.array(STEPS), np.array([[9.0, 4.0, 5.0, 6.0], [1.0, 2.0, 8.0, 3.0]])),
+         ("b", np.array(STEPS), np.array([[7.0], [6.0]]))], "regret, %"), [
+        (0, "line 0: a (n = 4)", "environment step", "regret, %", STEPS, [5.5, 2.5]),
         (0, "line 1", "environment step", "regret, %", STEPS, [9.0, 8.0]),
+        (0, "line 2: b (n = 1)", "environment step", "regret, %", STEPS, [7.0, 6.0]),
     ]),
     "values of a sweep": (lambda: sweep_charts.values(
         {"b": np.array([1.0, 2.0, 3.0, 8.0]), "a": np.array([4.0])}, "regret, %"), [
@@ -453,38 +460,15 @@ def test_what_is_drawn_is_in_the_unit_of_its_axis(name: str) -> None:
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=where)
 
 
-def drawn_as(figure: Figure, panel: int) -> list[str]:
-    """How the lines of a panel go from one point to the next."""
-    return [line.get_drawstyle() for line in figure.axes[panel].lines if len(line.get_xdata()) > 1]
-
-
-@pytest.mark.slow
-def test_what_holds_until_the_next_row_is_drawn_over_the_time_after_its_own() -> None:
-    """Pump rates and targets hold from their row on; an episode of a share has them at the end of their decision."""
-    after = "steps-post"
-    assert drawn_as(closed_loop(), 0)[:4] == ["default", after] * 2
-    assert drawn_as(closed_loop(), 1)[:2] == [after] * 2
-    assert drawn_as(composition(), 1) == drawn_as(composition(), 2) == ["default", after] * 2
-    assert drawn_as(composition(), 3) == [after] * 2
-    for method in ("prediction_error", "free_run"):
-        assert drawn_as(fit(method), 2) == [after]
-    assert [drawn_as(episodes(), panel) for panel in (0, 1)] == [["steps-pre", "default", "default"], ["steps-pre"] * 2]
-
-
 def test_rows_curves_and_counts_stand_beside_their_names() -> None:
     """Names in the order of the ranking, which is not that of the alphabet; a recording of three misses its truth."""
     values = DRAWN["values of a sweep"][0]().axes[0]
-    assert list(zip(values.get_yticks(), (t.get_text() for t in values.get_yticklabels()), strict=True)) == [
-        (0, "b"), (1, "a")
-    ]  # fmt: skip
+    names = [text.get_text() for text in values.get_yticklabels()]
+    assert (list(values.get_yticks()), names) == ([0, 1], ["b", "a"])
     assert values.get_ylim()[0] > 1 > 0 > values.get_ylim()[1]  # the first row on top
-    one, other = np.array([[1.0, 1.0]]), np.array([[2.0]])
-    drawn = sweep_charts.learning_curves([("b", np.ones(1), one), ("a", np.ones(1), other)], "")
-    lines = {line.get_label(): line.get_ydata()[0] for line in drawn.axes[0].lines if len(line.get_xdata())}
-    assert {name: lines[name] for name in ("b (n = 2)", "a (n = 1)")} == {"b (n = 2)": 1.0, "a (n = 1)": 2.0}
     for ax in coverage().axes:
         said = [text.get_text() for text in ax.get_legend().get_texts()]
-        assert said[:2] == ["95 % interval holds the truth: 2 of 3", "95 % interval misses it: 1 of 3"]
+        assert [line.partition(": ")[2] for line in said[:2]] == ["2 of 3", "1 of 3"]
 
 
 def test_the_temperature_of_equal_growth_is_where_both_curves_cross() -> None:
@@ -667,29 +651,15 @@ def test_every_law_keeps_its_mark_and_one_that_does_nothing_is_off_the_scale() -
     assert dots(paper.axes[1])[12.98, 2.24] == dots(paper.axes[1])[7.0, 2.24] == marks["mpc"]
 
 
-def test_every_curve_of_a_run_is_named_as_its_reactor_in_every_panel() -> None:
-    """The first reactor's setpoint is black, the other's has its own colour."""
-    drawn = closed_loop()
-    top, pump, heat = drawn.axes
-    named = {str(line.get_label()): line for line in top.lines if not str(line.get_label()).startswith("_")}
-    assert list(named) == ["M0", "setpoint", "M1", "not believed"]
-    for k, name in enumerate(("M0", "M1")):
-        assert np.nanmax(named[name].get_ydata()) == pytest.approx((k + 1) * 0.52)
-        assert {ax.lines[k].get_color() for ax in (pump, heat)} == {named[name].get_color()}
-    assert top.texts[0].get_text() == "M1 looked"
-    share = composition().axes[0]
-    entries = {text.get_text() for text in share.get_legend().get_texts()}
-    assert entries == {
-        "M0, estimate and 95 % band", "M1, estimate and 95 % band", "setpoint", "counted, 95 %",
-        "next setpoint, when announced",
-    }  # fmt: skip
-    lines = {str(line.get_label()): line for line in share.lines}
-    for k, name in enumerate(("M0", "M1")):
-        own = lines[f"{name}, estimate and 95 % band"]
-        assert own.get_ydata()[-1] == pytest.approx((k + 1) * 0.52)
-        band = [c for c in share.collections if isinstance(c, PolyCollection)][k]
-        assert to_hex(band.get_facecolor()[0]) == to_hex(own.get_color())
-        assert to_hex(share.containers[k].lines[0].get_color()) == to_hex(own.get_color())
+def test_every_curve_of_a_reactor_has_its_colour_in_every_panel() -> None:
+    """Of the share also its band and its counts; what was marked stands beside its line."""
+    run, share = closed_loop().axes, composition().axes
+    assert run[0].texts[0].get_text() == "M1 looked"
+    for k, own in enumerate(to_hex(colour) for colour in COLOURS[:2]):
+        band = [c for c in share[0].collections if isinstance(c, PolyCollection)][k]
+        lines = [run[0].lines[2 * k], *(ax.lines[k] for ax in (*run[1:], share[3], share[4]))]
+        lines += [share[1].lines[2 * k], share[2].lines[2 * k], share[0].containers[k].lines[0]]
+        assert {to_hex(line.get_color()) for line in lines} | {to_hex(band.get_facecolor()[0])} == {own}
 
 
 def test_a_calibration_tells_in_numbers_what_its_figures_show() -> None:
@@ -717,68 +687,33 @@ def test_a_calibration_tells_in_numbers_what_its_figures_show() -> None:
         assert trend in str(ax.lines[-1].get_label())
 
 
-def test_each_species_is_named_beside_its_own_curve() -> None:
-    pair = PairConfig()
-    growth, pigment = two().axes
-    lines = {text.get_text(): line for text, line in
-             zip(growth.get_legend().get_texts(), growth.get_legend().legend_handles, strict=True)}  # fmt: skip
-    assert list(lines)[:2] == [pair.first.name, pair.second.name]
-    drawn = {str(line.get_label()): line for line in growth.lines}
-    assert drawn[pair.first.name].get_ydata()[0] == pytest.approx(0.07727 * 29.0 - 1.66954)
-    assert pigment.lines[0].get_color() == drawn[pair.second.name].get_color()
-
-
-def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_from_the_same_start() -> None:
-    """Three starts, of which the second is at the lower setpoint; the optimum pumps up to 30 uL/s."""
-    minutes, goal = np.array([0.0, 2.0, 4.0]), np.array([0.8, 0.4, 0.8])
-    od, best = np.array([[0.9, 0.5, 0.7]] * 3) * np.array([[1.0], [0.9], [0.8]]), np.array([[0.91, 0.51, 0.71]] * 3)
-    rates, most = np.array([[0.001, 0.002, 0.003]] * 2), np.array([[0.01, 0.02, 0.03]] * 2)
-    axes = charts.trajectories(minutes, od, best, goal, rates, most).axes
-    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == (MIN, "OD", PUMP)
+@pytest.mark.parametrize(
+    ("relative", "said", "title"),
+    [
+        (False, (MIN, "OD", PUMP), "setpoint {:g}"),
+        (True, ("control periods", f"error e, {PERIODS}", "dose, share of full pump"), "growth takes {:g} of the pump"),
+    ],
+)
+def test_example_loops_stand_in_the_column_of_their_goal_with_the_optimum_from_the_same_start(relative, said, title):
+    """Three starts, of which the second has the lower goal; the optimum pumps up to 30 uL/s. 40 periods are shown."""
+    minutes, goal, n = np.arange(61.0), np.array([0.8, 0.4, 0.8]), 40 if relative else 61
+    od = np.linspace(0.9, 0.5, 61)[:, None] * np.array([1.0, 0.9, 0.8])
+    given = np.ones((60, 1)) * np.array([0.001, 0.002, 0.003])
+    loops = (od, od + 0.01, goal, given, 10.0 * given)
+    axes = (charts.relative_trajectories(*loops) if relative else charts.trajectories(minutes, *loops)).axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == said
     for column, (to, members) in enumerate(((0.4, (1,)), (0.8, (0, 2)))):
-        top, bottom = axes[column], axes[2 + column]
-        assert top.get_title() == f"setpoint {to:g}"
-        assert set(top.lines[0].get_ydata()) == {to}
+        top, bottom, scale = axes[column], axes[2 + column], 1.0 if relative else 1000.0
+        assert top.get_title() == title.format(to)
+        assert relative or set(top.lines[0].get_ydata()) == {to}
         for k, g in enumerate(members):
-            own, other = top.lines[1 + 2 * k : 3 + 2 * k]
-            assert own.get_label() == f"learned, from {od[0, g]:g}"
-            np.testing.assert_allclose(own.get_data(), [minutes, od[:, g]])
-            np.testing.assert_allclose(other.get_data(), [minutes, best[:, g]])
-            assert other.get_linestyle() == ":"
-            given, optimal = bottom.lines[2 * k : 2 * k + 2]
-            assert given.get_color() == own.get_color()
-            for line, rate in ((given, g + 1.0), (optimal, 10.0 * (g + 1.0))):
-                np.testing.assert_allclose(line.get_data(), [minutes[:-1], np.full(2, rate)])
-                assert line.get_drawstyle() == "steps-post"
-        assert bottom.get_ylim()[1] > 30.0
-    od, best, rates, most = (np.repeat(each, 20, axis=0) for each in (od, best, 10.0 * rates, 10.0 * most))
-    axes = charts.relative_trajectories(od, best, np.array([0.9, 0.1, 0.9]), rates, most).axes
-    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[2], "y")) == (
-        "control periods",
-        f"error e, {PERIODS}",
-        "dose, share of full pump",
-    )
-    for column, (to, members) in enumerate(((0.1, (1,)), (0.9, (0, 2)))):
-        assert axes[column].get_title() == f"growth takes {to:g} of the pump"
-        for k, g in enumerate(members):
-            own, other = axes[column].lines[2 * k : 2 * k + 2]
-            assert own.get_label() == f"learned, from {od[0, g]:g}"
-            np.testing.assert_allclose([own.get_ydata(), other.get_ydata()], [od[:40, g], best[:40, g]])
-            given, optimal = axes[2 + column].lines[2 * k : 2 * k + 2]
-            for line, level in ((given, 0.01 * (g + 1.0)), (optimal, 0.1 * (g + 1.0))):
-                np.testing.assert_allclose(line.get_data(), [np.arange(40), np.full(40, level)])
-                assert line.get_drawstyle() == "steps-post"
-            assert own.get_xdata().tolist() == other.get_xdata().tolist() == [*range(40)]
-
-
-def test_curves_of_several_seeds_say_how_many_they_are_and_one_where_its_policy_was_kept() -> None:
-    costs, regrets = np.array([[-0.2], [-30.0]]) - np.arange(5), np.array([[4.0], [0.5]]) + np.arange(5)
-    many, one = charts.learning(costs, np.array(STEPS), regrets, np.array([200.0, 100.0] * 2 + [100.0])), learning(1)
-    words = [text.get_text() for text in many.axes[1].get_legend().get_texts()]
-    assert words == ["range of 5 seeds", "middle half", "greedy policy, median"]
-    assert [text.get_text() for text in one.axes[1].get_legend().get_texts()] == ["greedy policy", "policy kept"]
-    kept = charts.learning(np.array([[-0.2], [-30.0]]), np.array(STEPS), np.array([[4.0], [0.5]]), np.array([100.0]))
-    assert kept.axes[1].lines[1].get_xdata()[0] == 100.0
+            line = 2 * k + (not relative)
+            for what, y in ((f"line {line}: learned, from {od[0, g]:g}", od), (f"line {line + 1}", od + 0.01)):
+                np.testing.assert_allclose(read(top, what), [minutes[:n], y[:n, g]])
+            for what, level in ((f"step {2 * k}", given), (f"step {2 * k + 1}", 10.0 * given)):
+                np.testing.assert_allclose(read(bottom, what), [minutes[: min(n, 60)], scale * level[:n, g]])
+            assert bottom.lines[2 * k].get_color() == top.lines[line].get_color() != top.lines[line + 1].get_color()
+        assert bottom.get_ylim()[1] > scale * 0.03
 
 
 def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_values_are_on_a_logarithmic_axis() -> None:
@@ -790,46 +725,25 @@ def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_valu
     assert [sweep_charts.values(each, "").axes[0].get_xscale() for each in (narrow, wide)] == ["linear", "log"]
 
 
-def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale() -> None:
-    """The optimum pumps up to 30 uL/s, and the learned policy never at all."""
-    x, y = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5])
-    none, most = np.zeros((2, 3)), np.array([[0.0, 0.01, 0.02], [0.01, 0.02, 0.03]])
-    for drawn, scale, end, *said in (
-        (charts.policy_map(x, y, none, most), 1000.0, 30.0, "OD x", "setpoint, OD", PUMP),
-        (charts.policy_map(x, y, none, most / 2.0), 500.0, 20.0, "OD x", "setpoint, OD", PUMP),
-        (
-            charts.relative_map(x, y, none, most),
-            1.0,
-            1.0,
-            f"error e, {PERIODS}",
-            "growth's share of the pump, s",
-            "dose, share of full pump",
-        ),
-    ):
-        assert [label(drawn.axes[0], "x"), label(drawn.axes[0], "y"), drawn.axes[2].get_ylabel()] == said
-        for ax, title, rates in zip(
-            drawn.axes, ("learned policy", "optimum (dynamic programming)"), (none, most), strict=False
-        ):
-            (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
-            assert ax.get_title() == title
-            edges = mesh.get_coordinates()
-            np.testing.assert_allclose((edges[0, :-1, 0] + edges[0, 1:, 0]) / 2.0, x)
-            np.testing.assert_allclose((edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2.0, y)
-            np.testing.assert_allclose(np.asarray(mesh.get_array()), scale * rates)
-            assert mesh.get_clim() == (0.0, end)
-
-
-def test_each_episode_of_a_share_has_a_column_of_its_own_with_names_for_its_curves() -> None:
-    hours, first, second = np.array([1.0, 2.0]), np.array([0.4, 0.5]), np.array([0.7, 0.6])
-    wanted = np.stack([first, second], axis=1)
-    shares = wanted, wanted - 0.1, wanted - 0.2
-    axes = composition_charts.episodes(hours, *shares, 30.0 + wanted, 33.0 + wanted, "B. subtilis").axes
-    words = [text.get_text() for text in axes[0].get_legend().get_texts()]
-    assert words == ["setpoint", "learned", "optimum"]
-    for column, own in enumerate((first, second)):
-        for line, word, off in zip(axes[column].lines, words, (0.0, 0.1, 0.2), strict=True):
-            np.testing.assert_allclose(line.get_ydata(), own - off)
-            assert line.get_label() == word
-        np.testing.assert_allclose([line.get_ydata() for line in axes[2 + column].lines], [30.0 + own, 33.0 + own])
-        colours = [line.get_color() for line in axes[column].lines[1:]]
-        assert [line.get_color() for line in axes[2 + column].lines] == colours
+@pytest.mark.parametrize(
+    ("draw", "unit", "most", "end", "said"),
+    [
+        (charts.policy_map, 1000.0, 0.03, 30.0, ("OD x", "setpoint, OD", PUMP)),
+        (charts.policy_map, 1000.0, 0.015, 20.0, ("OD x", "setpoint, OD", PUMP)),
+        (charts.relative_map, 1.0, 0.5, 1.0,
+         (f"error e, {PERIODS}", "growth's share of the pump, s", "dose, share of full pump")),
+    ],
+)  # fmt: skip
+def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale(draw, unit, most, end, said):
+    """The learned policy never pumps at all."""
+    x, y, best = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5]), most * np.array([[0.0, 0.3, 0.6], [0.3, 0.6, 1.0]])
+    drawn = draw(x, y, np.zeros((2, 3)), best)
+    assert (label(drawn.axes[0], "x"), label(drawn.axes[0], "y"), drawn.axes[2].get_ylabel()) == said
+    for ax, title, rates in zip(drawn.axes, ("learned", "optimum"), (np.zeros((2, 3)), best), strict=False):
+        (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+        assert ax.get_title().startswith(title)
+        edges = mesh.get_coordinates()
+        np.testing.assert_allclose((edges[0, :-1, 0] + edges[0, 1:, 0]) / 2.0, x)
+        np.testing.assert_allclose((edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2.0, y)
+        np.testing.assert_allclose(np.asarray(mesh.get_array()), unit * rates)
+        assert mesh.get_clim() == (0.0, end)
