@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -53,12 +54,17 @@ def nudged(given: policy.Policy) -> policy.Policy:
 
 
 @pytest.mark.parametrize(("file", "proof"), [("policy", "certificate"), ("seed0003", "seed0003.certificate")])
-def test_a_certified_policy_runs_on_a_device_and_its_run_keeps_both(tmp_path: Path, file: str, proof: str) -> None:
-    source = written(tmp_path / f"{file}.npz", laws.law())
-    unpacked(source, tmp_path / "run")
+def test_a_certified_policy_runs_on_a_device_and_its_run_keeps_both(tmp_path, file, proof, caplog):
+    unpacked(written(tmp_path / f"{file}.npz", laws.law()), tmp_path / "run")
     kept = tmp_path / "run" / "certificate.json"
     assert kept.read_bytes() == (tmp_path / f"{proof}.json").read_bytes()
     assert json.loads(kept.read_text())["of"] == fingerprints(policy.load(tmp_path / "run" / "policy.npz"))
+    unpacked(Path("shipped"), tmp_path / "run")
+    assert not warnings(caplog)
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
 
 
 def refused(path: Path, folder: Path, **changes: Any) -> str:
@@ -77,7 +83,6 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"given": laws.low_corner(), "safe": True, "passed": True, "checks": []},
         r"certified again .* washed out: 1, .*\(setpoint 0.45\)",
     ),
-    "elsewhere": ({"given": laws.law(), "setpoints": [0.5, 0.8]}, r"setpoints 0.5 to 0.8, .* asks for 0.45 "),
     "elsewhere on both sides": ({"given": laws.law(), "setpoints": [0.5, 0.6]}, r"0.5 to 0.6, .* asks for 0.45, 0.65 "),
     "damaged": ({"given": laws.law(), "setpoints": None}, r"certificate.json is damaged \(TypeError"),
     "of an unknown kind": (
@@ -197,18 +202,13 @@ def unpacked(path: Path, folder: Path, **changes: Any) -> assemble.Setup:
 def test_a_policy_without_certificate_is_refused_on_a_device_alone(tmp_path, caplog):
     source = tmp_path / "policy.npz"
     policy.save(source, laws.law())
-    with pytest.raises(
-        UserError, match=r"it has no certificate; .*: python -m experiments.certify policy=.*policy\.npz; force_policy"
-    ):
-        unpacked(source, tmp_path / "run")
+    assert f": python -m experiments.certify policy={source}; force" in refused(source, tmp_path / "run")
     for backend in (SimulatedConfig(), EmulatorConfig()):
         unpacked(source, tmp_path / "run", backend=backend)
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    assert not warnings(caplog)
     unpacked(source, tmp_path / "run", force_policy=True)
     unpacked(source, tmp_path / "run", resume="RUN")
-    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warned) == 2
-    assert all("it has no certificate" in line for line in warned)
+    assert ["it has no certificate" in line for line in warnings(caplog)] == [True, True]
 
 
 def test_the_fingerprints_are_of_what_decides_and_nothing_else() -> None:
@@ -240,16 +240,6 @@ PARTS: dict[str, tuple[policy.Policy, policy.Policy]] = {
     ),
 }  # fmt: skip
 """Part of a policy -> a policy, and one of which that part alone is another."""
-
-
-@pytest.mark.parametrize(("own", "other"), PARTS.values(), ids=list(PARTS))
-def test_a_device_names_the_part_of_a_policy_that_is_another(tmp_path, own, other, request):
-    part = request.node.callspec.id
-    source = written(tmp_path / "policy.npz", other, of=own)
-    with pytest.raises(
-        UserError, match=rf"policy refused: its certificate \S+ is for another: its {part} \(put it back"
-    ):
-        unpacked(source, tmp_path / "run")
 
 
 @pytest.fixture(scope="module")
@@ -309,49 +299,34 @@ def test_bounds_of_a_certificate_that_is_not_safe_let_nobody_act(relative: Path,
         assert (found.bounds is not None) is bounded, failure
 
 
-def test_settings_that_are_given_as_they_are_change_nothing(relative: Path, tmp_path: Path) -> None:
-    """In file and on the command line; the command line replaces the file."""
-    given, own = policy.load(relative), asdict(EstimatorConfig())
-    source = beside(relative, replace(given, metadata={**given.metadata, "estimator": own}), tmp_path)
-    assert unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0})).bounds
-    other = replace(given, metadata={**given.metadata, "estimator": {**own, "gate_sigma": 20.0}})
-    policy.save(source, other)
+@pytest.mark.parametrize("gate", [5.0, 20.0])
+def test_settings_of_the_file_give_way_to_the_same_ones_on_the_command_line(relative, tmp_path, gate):
+    given = policy.load(relative)
+    own = {**given.metadata, "estimator": {**asdict(EstimatorConfig()), "gate_sigma": gate}}
+    source = beside(relative, replace(given, metadata=own), tmp_path)
     assert unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0})).bounds
 
 
 @pytest.mark.parametrize(
     ("module", "name", "value", "said"),
     [
-        (filters, "FIXED", filters.Fixed(loud=30.0), r"filter\.loud = 30\.0, certified 21\.0"),
-        (filters, "FIXED", filters.Fixed(quiet=0.0), r"filter\.quiet = 0\.0, certified 0\.15"),
-        (
-            filters,
-            "FIXED",
-            filters.Fixed(gain_range=(0.2, 9.0)),
-            r"filter\.gain_range = \[0\.2, 9\.0\], certified \[0\.2, 3\.0\]",
-        ),
-        (learned, "WATCHED", 1.0, r"fallback\.watched_sd = 1\.0, certified 2\.0"),
+        (filters, "FIXED", filters.Fixed(loud=30.0), "filter.loud = 30.0, certified 21.0"),
+        (filters, "FIXED", filters.Fixed(quiet=0.0), "filter.quiet = 0.0, certified 0.15"),
+        (filters, "FIXED", filters.Fixed(gain_range=(0.2, 9.0)),
+         "filter.gain_range = [0.2, 9.0], certified [0.2, 3.0]"),
+        (learned, "WATCHED", 1.0, "fallback.watched_sd = 1.0, certified 2.0"),
+        (learned, "EstimatorConfig", partial(EstimatorConfig, gate_sigma=6.0),
+         "fallback.estimator.gate_sigma = 6.0, certified 5.0"),
     ],
-)
-def test_a_program_with_another_supervisor_is_another_policy(
-    relative: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str, value: Any, said: str
-) -> None:
-    unpacked(relative, tmp_path / "run")
-    monkeypatch.setattr(module, name, value)
-    with pytest.raises(UserError, match=rf"is for another: {said} \(put"):
-        unpacked(relative, tmp_path / "run")
-
-
-def test_the_second_filter_is_part_of_what_is_certified(relative, tmp_path, monkeypatch):
+)  # fmt: skip
+def test_another_supervisor_is_another_policy(relative, tmp_path, monkeypatch, module, name, value, said):
     """The file's own settings are the old ones, so the first filter is the certified one."""
     given = policy.load(relative)
     own = replace(given, metadata={**given.metadata, "estimator": asdict(EstimatorConfig())})
     source = beside(relative, own, tmp_path)
-    monkeypatch.setattr(learned, "EstimatorConfig", partial(EstimatorConfig, gate_sigma=6.0))
-    with pytest.raises(
-        UserError, match=r"is for another: fallback\.estimator\.gate_sigma = 6\.0, certified 5\.0 \(put"
-    ):
-        unpacked(source, tmp_path / "run")
+    unpacked(source, tmp_path / "run")
+    monkeypatch.setattr(module, name, value)
+    assert f"is for another: {said} (put" in refused(source, tmp_path / "run")
 
 
 def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
@@ -383,7 +358,7 @@ def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(rel
     setup = unpacked(relative, tmp_path / "run", bench=Bench(volume_ml=12.0))
     assert setup.bounds is not None
     assert setup.bounds.full_pump == pytest.approx(0.1)
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    assert not warnings(caplog)
 
 
 def certified(given: policy.Policy, folder: Path, *words: str) -> CertifyConfig:
@@ -446,15 +421,12 @@ def test_a_pump_so_weak_that_not_even_the_one_line_law_has_a_band_has_a_figure()
     assert figure(found).axes
 
 
-def test_a_policy_that_is_not_safe_ends_the_command_with_one_line_and_its_certificate_says_so(
-    undrawn: None, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level("INFO"), pytest.raises(UserError, match=r"policy\.npz: not safe, ") as caught:
+def test_a_policy_that_is_not_safe_ends_the_command_with_one_line_and_its_certificate_says_so(undrawn, tmp_path):
+    with pytest.raises(UserError) as caught:
         certified(laws.high_corner(), tmp_path)
     unsafe = [c for c in proven(laws.high_corner()).checks if c.kind == SAFETY and not c.holds]
     assert f" {len(unsafe)} of " in str(caught.value)
     assert str(caught.value).endswith(str(unsafe[0]))
-    assert any("policy=shipped" in line for line in caplog.messages)
     stored = certificate.load(tmp_path / "certificate.json")
     assert (stored.safe, stored.passed) == (False, False)
 
@@ -463,20 +435,22 @@ def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_s
     certified(laws.law(), tmp_path, "limits.entry=1", "limits.excess=0.0001")
     stored = certificate.load(tmp_path / "certificate.json")
     assert (stored.safe, stored.passed) == (True, False)
-    (warned,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    (warned,) = warnings(caplog)
     assert stored.failed
     assert all(str(check) in warned for check in worst(stored.failed))
 
 
-def test_a_policy_that_is_none_or_says_no_model_ends_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"no such file; give the policy\.npz"):
-        command.body(CertifyConfig(policy=str(tmp_path / "none.npz")), tmp_path)
-    with pytest.raises(UserError, match="^policy is empty"):
-        command.body(CertifyConfig(policy=""), tmp_path)
+def test_what_cannot_be_certified_ends_in_one_line(tmp_path: Path) -> None:
     given = laws.law()
     policy.save(tmp_path / "policy.npz", replace(given, metadata={**given.metadata, "model": {}}))
-    with pytest.raises(UserError, match=r"policy\.npz: it has no model .*; give env\.mu=MU env\.tau=TAU"):
-        command.body(CertifyConfig(policy=str(tmp_path)), tmp_path)
+    share = find_policy("shipped").with_name("coculture.npz")
+    for asked, words in (
+        (tmp_path / "none.npz", r"no such file; give the policy\.npz"), ("", "^policy is empty"),
+        (tmp_path, r"policy\.npz: it has no model .*; give env\.mu=MU env\.tau=TAU"),
+        (share, r"it sees \(logit_share, .*\); only density policies can be certified"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            command.body(CertifyConfig(policy=str(asked)), tmp_path)
 
 
 def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> None:
@@ -530,9 +504,7 @@ def test_a_certificate_goes_beside_its_policy_or_where_it_is_sent_and_never_into
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run_folder(
-    undrawn: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run_folder(undrawn, tmp_path, monkeypatch):
     write, to = files.write_json, tmp_path / "to.json"
 
     def full(path: Path, *given: Any, **named: Any) -> None:
@@ -543,7 +515,6 @@ def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run
     monkeypatch.setattr(files, "write_json", full)
     with pytest.raises(UserError, match=r"to\.json: not written \(No space left on device\); .*run/certificate\.json"):
         certified(laws.law(), tmp_path, f"to={to}")
-    assert "not written" in caplog.text
     assert certificate.load(tmp_path / "run" / "certificate.json").passed
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["passed"] is True
     assert not certificate.beside(tmp_path / "policy.npz").exists()
@@ -569,11 +540,6 @@ def test_what_is_told_of_a_certificate_is_what_fails_and_what_comes_closest() ->
     ]
     assert (found.safe, found.passed) == (False, False)
     assert ([c.value for c in found.failed(PERFORMANCE)], len(found.failed(SAFETY))) == ([0.5], 1)
-
-
-def test_the_shipped_policy_runs_on_a_device(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    unpacked(Path("shipped"), tmp_path)
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
@@ -662,22 +628,13 @@ def test_what_is_written_down_of_a_band_holds_what_was_proven(share: bool) -> No
         np.testing.assert_allclose(written_down, depth, atol=1.001e-3)
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({"od": -1.0}, "allowed numbers of 0 and more"),
-        ({"growth_share": float("nan")}, "allowed numbers of 0 and more"),
-        ({"proven": [0.9, 0.05]}, "ranges from low to high"),
-    ],
-)
-def test_bounds_that_cannot_be_are_damage(relative: Path, tmp_path: Path, changes: dict[str, Any], why: str) -> None:
-    content = json.loads(certificate.beside(relative).read_text())
-    path = tmp_path / "own" / "policy.npz"
-    path.parent.mkdir()
-    policy.save(path, policy.load(relative))
-    certificate.beside(path).write_text(json.dumps({**content, "bounds": {**content["bounds"], **changes}}))
-    with pytest.raises(UserError, match=f"is damaged .*{why}"):
-        unpacked(path, tmp_path / "run")
+@pytest.mark.parametrize("changes", [{"od": -1.0}, {"growth_share": float("nan")}, {"proven": [0.9, 0.05]}])
+def test_bounds_that_cannot_be_are_damage(relative: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
+    source = beside(relative, policy.load(relative), tmp_path)
+    content = json.loads(certificate.beside(source).read_text())
+    certificate.beside(source).write_text(json.dumps({**content, "bounds": {**content["bounds"], **changes}}))
+    with pytest.raises(UserError, match="is damaged .*allowed|is damaged .*ranges from low to high"):
+        unpacked(source, tmp_path / "run")
 
 
 @pytest.mark.parametrize("backend", [ChiBioConfig(), SimulatedConfig()])
@@ -687,11 +644,6 @@ def test_a_setting_of_an_estimator_that_cannot_be_is_one_line(relative, tmp_path
         unpacked(relative, tmp_path / "run", backend=backend, controller=LearnedConfig(estimator={key: value}))
 
 
-def test_a_policy_of_a_share_is_told_what_is_proven() -> None:
-    with pytest.raises(UserError, match=r"it sees \(logit_share, .*\); only density policies can be certified"):
-        command.body(CertifyConfig(policy=str(find_policy("shipped").with_name("coculture.npz"))), Path())
-
-
 def test_too_few_trajectories_are_asked_for_no_end_of_a_band() -> None:
     found = certify(laws.share_law(), replace(ASKED, trajectories=2000, quick=True))
     assert not [check for check in found.checks if "no attack reaches" in check.name]
@@ -699,12 +651,12 @@ def test_too_few_trajectories_are_asked_for_no_end_of_a_band() -> None:
 
 
 def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
-    """Of five strips from 0.3 to 0.8 the first and the fourth cannot be held, where every number is the largest."""
+    """Of five strips from 0.3 to 0.8 the first and the fourth cannot be held; there every number is an extreme."""
     strips, held = np.linspace(0.3, 0.8, 6), np.array([False, True, True, False, True])
 
     def where_held(*values: float) -> np.ndarray:
-        found = np.array([0.0, 9.0, 9.0, 0.0, 9.0])
-        found[~held], found[held] = 99.0, values
+        found = np.array([99.0, 0.0, 0.0, 0.0, 0.0])
+        found[held] = values
         return found
 
     proof = SimpleNamespace(
@@ -718,10 +670,6 @@ def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
         "over the law, largest": 0.03, "half-width in OD, middle strip": 0.5,
         "periods after the one-line controller, largest": 3.0, "periods, largest": 7.0,
     }  # fmt: skip
-    none = where_held(0.02, 0.05, 0.03)
-    none[~held] = 0.0
-    proof.half_width = none
-    assert command._row(loop, proof)["half-width, least"] == 0.02
 
 
 def test_a_drop_that_is_written_down_says_where_it_is_and_from_which_dose_to_which() -> None:
@@ -736,35 +684,27 @@ def test_a_drop_that_is_written_down_says_where_it_is_and_from_which_dose_to_whi
 
 
 def test_a_policy_is_proven_on_the_model_that_was_calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[CertifyConfig] = []
-
-    def enough(given: policy.Policy, config: CertifyConfig) -> Certificate:
-        asked.append(config)
-        raise CertificationError("far enough")
-
-    monkeypatch.setattr(command, "certify", enough)
+    asked = Mock(side_effect=CertificationError("far enough"))
+    monkeypatch.setattr(command, "certify", asked)
     policy.save(tmp_path / "policy.npz", laws.law())
     (tmp_path / "calibrated.yaml").write_text("mu: 0.02\ntau: 0.4\n")
     for given in ({}, {"env_file": str(tmp_path / "calibrated.yaml")}, {"env": EnvConfig(mu=0.025)}):
         with pytest.raises(UserError, match="far enough"):
-            command.body(CertifyConfig(policy=str(tmp_path), **given), tmp_path)  # type: ignore[arg-type]
-    models = [(config.env.mu, config.env.tau) for config in asked if config.env is not None]
-    assert models == [(0.03, 1 / 3), (0.02, 0.4), (0.025, 1 / 3)]
-    assert [config.env_file for config in asked] == [None] * 3
+            command.body(CertifyConfig(policy=str(tmp_path), **given), tmp_path)
+    configs = [call.args[1] for call in asked.call_args_list]
+    found = [(config.env.mu, config.env.tau, config.env_file) for config in configs]
+    assert found == [(0.03, 1 / 3, None), (0.02, 0.4, None), (0.025, 1 / 3, None)]
 
 
 def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(monkeypatch):
     monkeypatch.setattr(command, "_row", lambda loop, proof: proof.case)
     proofs = [SimpleNamespace(case=k, holdable=np.array(held)) for k, held in enumerate(([1, 1], [0, 0], [0, 1]))]
-    content = {name: name.upper() for name in ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks")}
+    kept = dict.fromkeys(("safe", "passed", "of", "setpoints", "bounds", "checks", "cannot_hold"), "kept")
     drop = {"first": -0.01, "second": 0.96, "from": 1, "to": 0}
-    content |= {"observation": ["od", "setpoint"], "not_monotone": [drop]}
-    content |= {"cannot_hold": ["x"], "strips": [0.0], "cases": ["of the certificate"]}
+    content = kept | {"observation": ["od", "setpoint"], "not_monotone": [drop], "strips": [0.0], "cases": ["other"]}
     found: Any = SimpleNamespace(proofs=proofs, question=SimpleNamespace(loop=None))
-    summary = command._summary(Path("a/policy.npz"), content, found)
-    assert summary.pop("cases") == [0, 2]
-    assert summary.pop("policy") == "a/policy.npz"
-    (named,) = summary.pop("a_higher_reading_gets_a_smaller_dose")
-    assert named == {"od": -0.01, "setpoint": 0.96, "from action": 1, "to action": 0}
-    left_out = ("strips", "cases", "not_monotone")
-    assert summary == {name: value for name, value in content.items() if name not in left_out}
+    named = {"od": -0.01, "setpoint": 0.96, "from action": 1, "to action": 0}
+    assert command._summary(Path("a/policy.npz"), content, found) == kept | {
+        "policy": "a/policy.npz", "cases": [0, 2], "a_higher_reading_gets_a_smaller_dose": [named],
+        "observation": ["od", "setpoint"],
+    }  # fmt: skip
