@@ -1,6 +1,7 @@
-"""Laws of the composition by hand, against the model, and at the door."""
+"""Laws of the composition by hand, against the model, by their regret; the program that they follow."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -14,8 +15,11 @@ from experiments.coculture.base import SEEN as COCULTURE
 from experiments.coculture.base import SEEN_AHEAD as COCULTURE_PREVIEW
 from experiments.coculture.base import SHARE, ShareEstimate, Wanted
 from experiments.coculture.program import Program
+from experiments.coculture.task import Coculture
 from experiments.laws import registry
+from experiments.training.evaluation import Evaluation
 from hardware import memory
+from tests.studies import learners
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
 pytestmark = pytest.mark.numeric
@@ -375,3 +379,123 @@ def test_a_midpoint_law_that_has_begun_is_not_on_its_way_to_another_change():
     assert begun.act(seen(logit(0.3)), asked(0.3, 0.7, 90.0), *at(0))[0] == 29.0
     targets = [each.act(seen(logit(0.42)), asked(0.3, 0.32, 85.0), *at(5))[0] for each in (begun, other)]
     assert targets == [36.0, 36.0]
+
+
+PREVIEW = CocultureConfig(control_min=30.0, episode_steps=24, preview_min=360.0)
+
+
+@pytest.fixture(scope="module")
+def regret() -> Callable[[str, CocultureConfig], float]:
+    """Of a law on the reported grid, per cent."""
+    known: dict[CocultureConfig, Evaluation] = {}
+
+    def of(name: str, config: CocultureConfig) -> float:
+        if config not in known:
+            task = Coculture(config)
+            known[config] = Evaluation(task, task.report_grid())
+        return 100.0 * (learners.one_line(name, config, known[config].start) / known[config].optimum_cost - 1.0)
+
+    return of
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "expected"), [("proportional", 0.106), ("inverse_dynamics", 0.094), ("bang_bang", 0.134), ("pi", 2.33)]
+)
+def test_without_preview_simple_laws_are_close(regret, name: str, expected: float) -> None:
+    assert regret(name, CocultureConfig()) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "expected"), [("midpoint", 13.0), ("proportional", 375.5)])
+def test_with_preview_the_time_to_begin_decides(regret, name: str, expected: float) -> None:
+    assert regret(name, PREVIEW) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("hours", "expected"), [(1, 283.4), (2, 149.4), (3, 75.1)])
+def test_how_far_a_plan_must_reach(hours: int, expected: float) -> None:
+    task = Coculture(PREVIEW)
+    score = Evaluation(task, task.report_grid())(learners.planned(task, 60 * hours), 1)
+    assert score.regret_pct[0] == pytest.approx(expected, rel=0.05)
+
+
+EVENTS = Program((NAN, 0.3, 0.7, 0.7, 0.3, NAN, 0.5), (60.0, 360.0, 300.0, 300.0, 60.0, 60.0, 60.0))
+
+
+def told(program, minute, preview_min):
+    found = program.wanted(np.array([float(minute)]), preview_min)
+    return tuple(float(v[0]) for v in (found.setpoint, found.following, found.minutes))
+
+
+@pytest.mark.parametrize(
+    ("minute", "preview", "expected"),
+    [
+        (60, 0.0, (0.3, 0.3, 0.0)),
+        (60, 360.0, (0.3, 0.7, 360.0)),
+        (60, 359.0, (0.3, 0.3, 0.0)),
+        (419, 360.0, (0.3, 0.7, 1.0)),
+        (420, 360.0, (0.7, 0.7, 0.0)),  # .7 goes on for 600 min
+        (700, 360.0, (0.7, 0.3, 320.0)),
+        (1050, 360.0, (0.3, 0.3, 0.0)),  # nothing is asked for after it
+        (1150, 360.0, (0.5, 0.5, 0.0)),
+        (5000, 360.0, (0.5, 0.5, 0.0)),  # the last one after the end
+    ],
+)
+def test_a_change_is_announced_as_early_as_it_says(minute, preview, expected):
+    assert told(EVENTS, minute, preview) == expected
+
+
+@pytest.mark.parametrize("minute", [-1.0, NAN, 0.0, 59.0, 1080.0])
+def test_where_nothing_is_asked_for_nothing_is(minute):
+    assert np.isnan(EVENTS.setpoint(np.array([minute]))[0])
+    assert np.isnan(told(EVENTS, minute, 360.0)[0])
+    assert told(EVENTS, minute, 360.0)[2] == 0.0
+
+
+def test_a_sine_falls_first_and_is_announced_as_a_step():
+    sine = Program((), (2400.0,), (0.5, 0.4, 1200.0))
+    assert told(sine, 0, 0.0) == pytest.approx((0.5, 0.5, 0.0))
+    assert told(sine, 300, 0.0)[0] == pytest.approx(0.1)
+    assert told(sine, 900, 360.0) == pytest.approx((0.9, 0.5, 120.0))
+    assert told(sine, 900, 100.0) == pytest.approx((0.9, 0.5 + 0.4 * np.cos(np.pi / 6.0), 40.0))
+    assert told(sine, 2200, 360.0)[2] == 0.0  # what comes after the end is nobody's business
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        (((0.3, 0.7), (60.0,)), "scenario.ratios"),
+        (((1.2,), (60.0,)), "each 0 < share < 1"),
+        (((), (60.0,), (0.5, 0.5, 600.0)), "0 < mean"),
+        (((), (60.0,)), "scenario.ratios"),
+    ],
+)
+def test_a_program_that_cannot_be_is_refused(values, says):
+    with pytest.raises(ValueError, match=says):
+        Program(*values)
+
+
+def test_when_changes_are_announced() -> None:
+    """Each as long before it as asked for, but not before its phase begins; phases of one share are one."""
+    program = Program((NAN, 0.3, 0.3, 0.7, NAN, 0.5, 0.2), (60.0, 100.0, 200.0, 30.0, 10.0, 500.0, 20.0))
+    minute, share = program.announcements(150.0)
+    assert minute.tolist() == [210.0, 750.0]  # .3 to .7 at 360, .5 to .2 at 900
+    assert share.tolist() == [0.7, 0.2]
+    minute, _ = program.announcements(1000.0)
+    assert minute.tolist() == [60.0, 400.0]
+    assert program.announcements(0.0)[0].size == 0
+    assert Program((), (60.0,), (0.5, 0.2, 100.0)).announcements(60.0)[0].size == 0
+    assert program.extremes == (0.3, 0.3, 0.7, 0.5, 0.2)
+    assert Program((), (60.0,), (0.5, -0.2, 100.0)).extremes == (0.3, 0.7)
+
+
+def test_a_sine_holds_only_where_a_share_is_asked_for_and_counts_from_the_beginning_of_the_program() -> None:
+    """The hour without one is part of its period of 12 h; nothing is announced into the last phase or from it."""
+    sine = Program((NAN, 0.5, NAN), (60.0, 600.0, 120.0), (0.5, 0.3, 720.0))
+    wanted = sine.setpoint(np.array([0.0, 59.0, 60.0, 180.0, 540.0, 700.0, 5000.0]))
+    np.testing.assert_allclose(wanted, [NAN, NAN, 0.35, 0.2, 0.8, NAN, NAN], atol=1e-9)
+    assert told(sine, 180, 240.0) == pytest.approx((0.2, 0.65, 96.0))  # s(420) = .5 - .3 sin(7 pi / 6)
+    assert told(sine, 500, 240.0)[2] == 0.0
+    assert (sine.asked, Program((NAN, NAN), (60.0, 60.0)).asked) == (True, False)
+    assert sine.edges.tolist() == [0.0, 60.0, 660.0, 780.0]

@@ -1,8 +1,4 @@
-"""Every controller of the list through `deploy`, on simulated vials and on the emulated device, to its last file.
-
-The device is the emulator itself behind the driver, in this process and in virtual time; one run takes the real way, a
-process of its own behind a real socket.
-"""
+"""Every controller of the list through `deploy`, on simulated vials and on the emulated device in virtual time."""
 
 import csv
 import json
@@ -29,6 +25,7 @@ from experiments.control import run
 from experiments.control.config import DeployConfig
 from experiments.laws import registry
 from experiments.laws.registry import KINDS
+from experiments.loop.loop import ClosedLoop, Step
 from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
@@ -162,3 +159,46 @@ def test_an_end_before_the_pumps_were_looked_at_says_so(
         with pytest.raises(error), kind().open(opening):
             pass
     assert ("pumps not verified off" in caplog.text) == said
+
+
+def virtual(resume: str | None = None) -> DeployConfig:
+    """Two unlike schedules' worth of work in a few minutes, on one vial that begins near its setpoint."""
+    backend = EmulatorConfig(reactors=("M1",), speed=0.0, od=0.7)
+    scenario = Scenario((0.65, 0.5), (7.0, 4.0), (37.0, 37.0))
+    return DeployConfig(backend, scenario=scenario, controller=registry.config("pi"), fsync=False, resume=resume)
+
+
+def made(at: Path) -> Path:
+    at.mkdir()
+    return at
+
+
+def test_a_run_in_virtual_time_completes_and_repeats_to_the_byte(tmp_path: Path) -> None:
+    runs = [made(tmp_path / name) for name in "ab"]
+    for folder in runs:
+        run.deploy(virtual(), folder)
+    assert json.loads((runs[0] / "summary.json").read_text())["outcome"] == "completed"
+    first, second = ((folder / "recordings" / "M1.csv").read_text().splitlines() for folder in runs)
+    assert [line for line in first if line[:1] != "#"] == [line for line in second if line[:1] != "#"]
+
+
+def test_time_stands_still_between_two_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, steps = made(tmp_path / "run"), []
+    original = ClosedLoop.step
+
+    def killed(loop: ClosedLoop) -> Step:
+        if len(steps) == 5:
+            raise RuntimeError("the program dies")
+        steps.append(original(loop))
+        return steps[-1]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ClosedLoop, "step", killed)
+        with pytest.raises(Exception, match="the program dies"):
+            run.deploy(virtual(), folder)
+    before = max(float(row.get("time_s") or 0.0) for row in read_journal(folder / "journal.jsonl")[0])
+    run.deploy(virtual(resume=str(folder)), folder)
+    rows = read_journal(folder / "journal.jsonl")[0]
+    lives = [n for n, row in enumerate(rows) if row["kind"] == "start"]
+    assert len(lives) == 2
+    assert before <= float(rows[lives[1]]["time_s"]) < before + 60.0

@@ -1,4 +1,4 @@
-"""One client per device, by whatever name or link it is reached; a device that is not there is told at once."""
+"""One client per device, by whatever name or link it is reached; a device or cable that is gone is told at once."""
 
 import json
 import os
@@ -14,7 +14,10 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
 from hardware.chibio.messages import WrongStatus
 from hardware.emulator.process import EmulatorProcess
+from hardware.errors import LinkError
 from hardware.link.messages import DeviceTaken
+from hardware.link.serial import SerialTransport
+from tests.hardware.test_serial_transport import Cable, cable, config  # noqa: F401  (cable is a fixture)
 from tests.programs import Program, run
 
 
@@ -81,3 +84,23 @@ def test_a_service_manager_that_ends_a_blank_leaves_its_pumps_off(tmp_path: Path
             assert json.load(answer)["Pump1"]["ON"] == 0
     assert status == 130
     assert "Traceback" not in said
+
+
+TOGGLE = "/SetOutputOn/Pump3/2/M0"
+
+
+def test_a_line_that_was_unplugged_is_reopened_and_carries_out_nothing_twice(
+    cable: tuple[Cable, EmulatorProcess],  # noqa: F811
+) -> None:
+    line, _ = cable
+    link = SerialTransport(str(line.pc), 60.0, config(line.pc, floor_s=2.0))  # a busy machine may be late
+    link.post("/SetOutputTarget/Pump3/M0/0.001")
+    for k in range(1, 4):
+        assert link.post(TOGGLE).status == 204
+        line.unplug()
+        for _ in range(2):
+            with pytest.raises(LinkError):
+                link.post(TOGGLE)
+        line.plug()
+        assert json.loads(link.get("/getSysdata/").body)["Pump3"]["ON"] == k % 2
+    link.close()

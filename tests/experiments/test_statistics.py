@@ -1,16 +1,24 @@
-"""Numbers of a comparison from two replicates whose errors are constant, all by hand."""
+"""Numbers of a comparison and of a window, by hand; how often an estimate was as near to the truth as it said."""
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
+from envs.bench import Bench
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
+from envs.task import EnvConfig
 from experiments.comparison import statistics
 from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_pairs, totals
-from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, windows
+from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, run_trial, windows
+from experiments.loop.metrics import mean_errors, window_metrics
+from experiments.loop.signals import Density, within_2sd
+from hardware.emulator.device import plant_preset
 
 NAMES = {"signal": "density", "controller": "pi", "plant": "quiet", "scenario": "steps"}
 
@@ -179,3 +187,166 @@ def test_medians_of_costs_and_of_differences_are_those_of_the_replicates_and_not
     assert (late["difference"], late["median"]) == pytest.approx((450.0 * sum(off) / 7.0, 450.0 * 0.04))
     assert late["median_ci95"] == pytest.approx([450.0 * 0.01, 450.0 * 0.9])
     assert late["lower_in"] == 0
+
+
+def test_settling_is_the_first_moment_after_which_the_band_is_kept():
+    t = np.arange(0.0, 31.0)[None]
+    od = np.where(t < 10, 0.8, 0.5)
+    od[0, 14] = 0.53  # outside 5 % of 0.5 once more
+    m = window_metrics(t, od, 0.5, 0.0, 30.0)
+    assert m.settling_min[0] == 15.0
+    assert m.steady_abs_error[0] == 0.0
+
+
+def test_two_samples_make_a_metric_one_makes_none_and_the_end_needs_a_sample_of_its_own():
+    """e = 0.1 over 30 min: ISE 0.3, ITAE 45; time counts from the window, not from the run."""
+    t = np.array([[0.0, 30.0, np.nan], [29.0, np.nan, np.nan], [0.0, 1.0, 19.9], [0.0, 1.0, 20.0]]) + 30.0
+    m = window_metrics(t, np.where(np.isfinite(t), 0.6, np.nan), 0.5, 30.0, 60.0)
+    np.testing.assert_allclose(m.ise, [0.3, np.nan, 0.199, 0.2])
+    np.testing.assert_allclose(m.itae, [45.0, np.nan, 19.8005, 20.0])
+    np.testing.assert_allclose(m.steady_abs_error, [0.1, np.nan, np.nan, 0.1])
+    assert np.isnan(m.settling_min).all()
+
+
+def test_missing_samples_are_bridged():
+    """A linear error is integrated exactly by trapezia, however many samples are missing between."""
+    t = np.arange(0.0, 31.0)
+    od = 0.5 + 0.01 * t
+    full = window_metrics(t[None], od[None], 0.5, 0.0, 30.0)
+    holes_t, holes_od = t.copy(), od.copy()
+    holes_t[[3, 4]], holes_od[[7, 20]] = np.nan, np.nan
+    holes = window_metrics(holes_t[None], holes_od[None], 0.5, 0.0, 30.0)
+    assert full.ise[0] == pytest.approx(1e-4 * 30**3 / 3, rel=2e-3)
+    assert holes.ise[0] == pytest.approx(full.ise[0], rel=5e-3)
+
+
+def test_a_run_without_a_sample_has_no_metrics():
+    metrics = window_metrics(np.empty((2, 0)), np.empty((2, 0)), 0.5, 0.0, 30.0)
+    for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
+        np.testing.assert_array_equal(getattr(metrics, key), [np.nan, np.nan])
+
+
+def test_the_last_two_hours_begin_no_earlier_than_the_window():
+    """300 min at 0.2 from the setpoint, then 90 min at 0.03: all of these are its last two hours. Then 200 min, of
+    which the first 80 are 0.2 away and the last 120 0.05."""
+    minute = np.arange(591.0)[None]
+    error = np.select([minute < 300, minute < 390, minute < 470], [0.2, 0.03, 0.2], 0.05)
+    found = [mean_errors(minute, 0.5 - error, np.full_like(minute, 0.5), *w) for w in ((300.0, 390.0), (390.0, 590.0))]
+    assert [value[0] for value in found[0]] == pytest.approx([0.03, 0.03])
+    assert [value[0] for value in found[1]] == pytest.approx([(80 * 0.2 + 120 * 0.05) / 200, 0.05])
+
+
+def test_a_later_window_counts_from_its_own_start_on_either_side_of_its_setpoint() -> None:
+    """From minute 30 on: 20 % too high for 12 min, then 4 % too low; the other 4 % too high after 20 min of too low."""
+    minute = np.tile(np.arange(0.0, 91.0), (2, 1))
+    t = minute[0] - 30.0
+    od = 0.5 + np.stack([np.where(t < 12.0, 0.1, -0.02), np.where(t < 20.0, -0.1, 0.02)])
+    m = window_metrics(minute, od, 0.5, 30.0, 60.0)
+    assert m.settling_min.tolist() == [12.0, 20.0]
+    whole = [(11 * 0.1 + 0.06 + 18 * 0.02) / 30.0, (19 * 0.1 + 0.06 + 10 * 0.02) / 30.0]  # trapezia of |e|
+    np.testing.assert_allclose(m.abs_error, whole)
+    ise = np.array([11 * 0.01 + 0.0052 + 18 * 0.0004, 19 * 0.01 + 0.0052 + 10 * 0.0004])
+    np.testing.assert_allclose(m.ise, ise)
+    np.testing.assert_allclose(m.ise_mean, ise / 30.0)
+    np.testing.assert_allclose(m.itae_mean, m.itae / 30.0)
+
+
+def test_the_steady_error_is_that_of_the_last_ten_minutes_with_both_their_ends() -> None:
+    """Minutes 20 to 30 of 30: the sample at 19 is not one of them, those at 20 and at 30 are."""
+    minute = np.tile(np.arange(0.0, 31.0), (2, 1))
+    od = np.full((2, 31), 0.52)
+    od[0, 19], od[0, 20], od[1, 30] = 0.9, 0.63, 0.41
+    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
+    np.testing.assert_allclose(m.steady_abs_error, [(0.13 + 10 * 0.02) / 11, (0.09 + 10 * 0.02) / 11])
+
+
+def test_a_window_whose_first_sample_is_missing_is_integrated_from_the_next_one() -> None:
+    """e = 0.1 from minute 2 on of 30, and to minute 28; |e| by time is half of 28^2 - 2^2, times 0.1."""
+    minute = np.arange(0.0, 31.0)[None]
+    od = np.full((1, 31), 0.6)
+    od[0, [0, 1, 29, 30]] = np.nan
+    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
+    assert m.ise[0] == pytest.approx(26 * 0.01)
+    assert m.itae[0] == pytest.approx(0.1 * (28.0**2 - 2.0**2) / 2)
+    assert m.abs_error[0] == pytest.approx(26 * 0.1 / 30.0)
+
+
+class Told:
+    """Doses the share at rest; says that a supervisor acts wherever it was not asked, and e to be `off` too high."""
+
+    def __init__(self, off: float = 0.0) -> None:
+        self.off = off
+
+    def reset(self, n: int) -> None:
+        self._asked, self._od, self._setpoint = np.zeros(n, dtype=bool), np.zeros(n), np.ones(n)
+
+    def act(self, od: Any, setpoint: Any, minute: Any, rows: Any) -> Any:
+        self._asked, self._od, self._setpoint = rows, od, setpoint
+        return np.full(len(od), 0.01)
+
+    def explain(self) -> dict[str, Any]:
+        n = len(self._od)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.log(self._od / self._setpoint) / 0.06 + self.off
+        estimates = {"error": error, "growth_share": np.full(n, 0.5), "supervised": 1.0 - self._asked}
+        return estimates | dict.fromkeys(("error_sd", "growth_share_sd"), np.full(n, 0.1))
+
+
+@pytest.mark.parametrize("flow", [1.0, 0.5])
+def test_a_smaller_vial_rests_at_the_same_share_of_its_own_largest_rate(flow: float) -> None:
+    """0.03 1/min of 0.06: 1.2 mL a minute from 20 mL, and 0.72 from 12; also by a pump of half the flow."""
+    volumes, bench = np.array([12.0, 20.0]), Bench()
+    preset = plant_preset("nominal")
+    plant = Plant(replace(preset, pump=replace(preset.pump, gain_ml_s=flow)), 2, np.random.default_rng(0), volumes)
+    law = Told()
+    law.reset(2)
+    density = Density(law, volumes / 20.0, bench.max_rate)
+    density.known(plant, flow, bench)
+    assert density.truth is not None
+    error, share = density.truth(np.array([0.4, 0.6]))
+    np.testing.assert_allclose(share, 0.5, rtol=1e-9)
+    np.testing.assert_allclose(error, np.log(plant.apparent_od / [0.4, 0.6]) / 0.06, rtol=1e-9)
+
+
+def test_a_dose_is_told_by_what_it_is_of_the_bench_s_vial() -> None:
+    """.7 mL into 14 mL dilute as 1 mL into 20; what a tube kept counts as well."""
+    told: list[Any] = []
+    law: Any = SimpleNamespace(dosed=lambda ml: told.append(ml.tolist()), restore=None)
+    Density(law, np.array([0.7, 1.0])).dosed(np.array([0.7, 0.7]), np.array([0.14, 0.2]), np.array([1, 1]))
+    assert told == [pytest.approx([1.2, 0.9])]
+
+
+def test_another_period_has_another_full_pump() -> None:
+    """2 min of 0.01 mL/s are as much as 1 min of 0.02; growth in 2 min is twice as much: 0.06 of 0.06."""
+    bench = Bench(period_s=120.0, max_rate=0.01)
+    plant = Plant(plant_preset("nominal"), 1, np.random.default_rng(0))
+    density = Density(Told(), 1.0, bench.max_rate)
+    density.known(plant, 1.0, bench)
+    assert density.truth is not None
+    np.testing.assert_allclose(density.truth(np.array([0.5]))[1], 1.0, rtol=1e-9)
+
+
+def test_two_standard_deviations_count_on_either_side() -> None:
+    off = np.array([-2.1, -1.9, 0.0, 1.9, 2.1, np.nan])
+    why = {"error": 0.3 + 0.1 * off, "error_sd": np.full(6, 0.1), "true_error": np.full(6, 0.3)}
+    np.testing.assert_array_equal(within_2sd(why)["error"], [0.0, 1.0, 1.0, 1.0, 0.0, np.nan])
+    assert list(within_2sd(why)) == ["error"], "the truth of the other is not known"
+
+
+@pytest.mark.parametrize(("off", "inside"), [(0.0, 1.0), (-0.19, 1.0), (-0.21, 0.0), (0.21, 0.0)])
+def test_decisions_are_counted_from_where_the_schedule_begins(off: float, inside: float) -> None:
+    """The culture grows for some minutes to 0.5 first, in which the law is not asked."""
+    schedule = Scenario((0.5,), (20.0,), (37.0,), recovery_od=0.5)
+    preset = replace(plant_preset("nominal"), start_od=0.4)
+    found = run_trial(Cell("told", "nominal", "hold"), preset, schedule, lambda _: Told(off), EnvConfig(), 3, 0)
+    np.testing.assert_array_equal(found.told["supervised"], [0.0] * 3)
+    np.testing.assert_allclose(found.told["error"], inside)
+    np.testing.assert_allclose(found.told["growth_share"], 1.0)
+
+
+def test_totals_tell_the_mean_over_vials_in_per_cent() -> None:
+    told = {"supervised": np.array([0.0, 0.0, 0.3]), "growth_share": np.array([1.0, 1.0, 0.7])}
+    [found] = totals([replace(trial(error=(0.1, 0.2, 0.6)), told=told)])
+    assert found["supervised_pct"] == pytest.approx(10.0)
+    assert found["share_2sd_pct"] == pytest.approx(90.0)
+    assert "error_2sd_pct" not in found

@@ -1,7 +1,12 @@
-"""A third fluid and an actuator of one's own, each commanded by a signal: dosed, booked, limited, resumed, refused."""
+"""A third fluid, an actuator, a signal and a family of reactors of one's own: commanded, booked, resumed, refused."""
 
+import csv
+import importlib.util
 import json
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,16 +14,28 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf import presets
+from conf.messages import NameTaken
+from dqn import policy as policies
 from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
+from experiments.coculture.signal import COLUMNS
 from experiments.control import assemble
+from experiments.control import run as control
+from experiments.control.assemble import unpack
+from experiments.control.timetable import timetable
+from experiments.deploy import main
 from experiments.laws import registry
+from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.messages import NoActuator, PartMissing, WrongShape
 from experiments.loop.signals import Findings
+from experiments.record.recovery import COLUMNS as USUAL
+from experiments.training import agents, tasks
+from hardware import family
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.chibio.dosing import SupplyConfig
 from hardware.family import family_of
@@ -27,10 +44,16 @@ from hardware.pioreactor.doses import replay
 from hardware.reactor import Command, Receipt
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
+from tests.evolver_stub import VIALS, EvolverStub
+from tests.experiments import laws
+from tests.experiments.test_composition_deploy import rows
+from tests.extensions import light
 from tests.extensions.drug import Drug, StressConfig
 from tests.hardware.emulator_lab import BIAS_S, quiet
 from tests.hardware.pioreactor_lab import ALT_PIN, Lab
+from tests.programs import ROOT, Program, run
 
 HOUR = Scenario((0.45,), (60.0,), (37.0,))
 SOON = StressConfig(growth=0.012, gain=0.03, most=0.007, memory=3.0)
@@ -233,3 +256,179 @@ def test_a_signal_without_a_part_is_refused() -> None:
 def test_what_cannot_give_it_is_refused_before_anything_begins(changes, said, tmp_path):
     with pytest.raises(frame.UserError, match=said):
         assemble.unpack(drugged(**changes), tmp_path)
+
+
+DRIVER = ROOT / "tests" / "evolver.py"
+AWAY = "http://127.0.0.1:9"
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver's file is loaded, as by `extend=`, and forgotten afterwards."""
+    monkeypatch.setattr(presets, "_added", dict(presets._added))
+    monkeypatch.setattr(family, "_loaded", dict(family._loaded))
+    spec = importlib.util.spec_from_file_location("evolver_of_the_tests", DRIVER)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+
+
+@pytest.fixture
+def device() -> Iterator[EvolverStub]:
+    with EvolverStub() as stub:
+        yield stub
+
+
+def words(url: str, *more: str) -> list[str]:
+    hold = ["scenario=hold", "scenario.setpoints=[0.5]", "scenario.minutes=[25]", "fsync=false"]
+    return ["backend=evolver", f"backend.url={url}", "controller=pi", *hold, *more]
+
+
+def looked_at(url: str, folder: Path) -> None:
+    assemble.run_preflight(assemble.unpack(main.config(words(url, "preflight_only=true")), folder), folder)
+
+
+def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_server_is_away(
+    known: None, device: EvolverStub, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        looked_at(device.url, tmp_path)
+    said = [record.getMessage() for record in caplog.records]
+    assert sum("pass  v" in line and " sample: OD 0." in line for line in said) == VIALS
+    assert said.count("pass  v3 pumps: verified off") == 1
+    assert not device.fed_ml.any()
+    device.stuck = {3}
+    away = rf"1 of 1 checks failed, the first: FAIL  reactors: no answer from {AWAY}/off .*check cable"
+    for url, words in ((device.url, "FAIL  reactors: v3: pumps still on; switch them off by hand"), (AWAY, away)):
+        with pytest.raises(frame.UserError, match=words):
+            looked_at(url, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "refusal"),
+    [
+        (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence, by which"),
+        (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no pump [34] to spare; drop it"),
+        (["at_end=regulate"], "at_end = regulate: backend=evolver has no regulation of its own; allowed hold, stop"),
+        (["controller=oracle"], "oracle: knows a simulated plant; allowed with backend=sim only, not backend=evolver"),
+        (["backend.reactors=[a,b]"], "backend.reactors = .*: allowed 16 different names"),
+        (["plant_file=twin.yaml"], "backend.kind = evolver: allowed sim with plant_file"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(known: None, tmp_path: Path, given: list[str], refusal: str) -> None:
+    with pytest.raises(frame.UserError, match=refusal):
+        assemble.unpack(assemble.completed(main.config(words(AWAY, *given))), tmp_path)
+    assert not (tmp_path / "policy.npz").exists()
+
+
+def test_a_culture_is_at_stake(known: None, tmp_path: Path) -> None:
+    policies.save(tmp_path / "policy.npz", laws.law())
+    poor = ["controller=dqn", f"policy={tmp_path / 'policy.npz'}"]
+    with pytest.raises(frame.UserError, match="policy refused: .*force_policy=true runs it all the same"):
+        assemble.unpack(main.config(words(AWAY, *poor)), tmp_path)
+    assert assemble.unpack(main.config(words(AWAY, *poor, "force_policy=true")), tmp_path).policy is not None
+
+
+def test_its_dry_run_says_where_it_is(known: None) -> None:
+    text = timetable(main.config(words(AWAY)), "HERE", datetime(2026, 3, 2, 12, 0))
+    assert f"backend evolver ({AWAY}), reactors v0, v1" in text
+    assert text.count("bench.bottle_ml=2000 lasts") == VIALS
+
+
+def fed(run: Path) -> np.ndarray[Any, Any]:
+    """What the recordings say that each vial got, mL."""
+    found = []
+    for n in range(VIALS):
+        with open(run / f"recordings/v{n}.csv", newline="", encoding="utf-8") as f:
+            found.append(sum(float(row["volume_ml"]) for row in csv.DictReader(f)))
+    return np.array(found)
+
+
+def test_a_run_is_killed_in_a_dose_and_goes_on(device: EvolverStub, tmp_path: Path) -> None:
+    """A dose that was given and not answered is counted once, none is given twice, and all sixteen are held."""
+    device.hold_at = "15"
+    given = "experiments.deploy", f"extend={DRIVER}", *words(device.url), "hydra.run.dir=here"
+    with Program(*given, cwd=tmp_path, out=tmp_path / "out", WITHOUT_FIGURES="1") as first:
+        assert device.held.wait(120.0), first.said()
+    device.go.set()
+    done = run("experiments.deploy", "resume=here", cwd=tmp_path, WITHOUT_FIGURES="1")
+    assert done.returncode == 0, done.stderr + done.stdout
+    summary = json.loads((tmp_path / "here/summary.json").read_text())
+    assert summary["outcome"] == "completed"
+    assert len(summary["reactors"]) == VIALS
+    np.testing.assert_allclose(fed(tmp_path / "here"), device.fed_ml, rtol=1e-9)
+    assert device.fed_ml.min() > 1.0
+    intents = [row for row in read_journal(tmp_path / "here/journal.jsonl")[0] if row["kind"] == "intent"]
+    assert len({(row["id"], row["reactor"]) for row in intents}) == len(intents)
+    assert max(w["steady_abs_error"] for w in summary["windows"]) < 0.05
+
+
+HOLD = ("plant=coculture", "scenario=hold", "scenario.setpoints=[0.5]", "scenario.temperatures=[33.2]")
+WORDS = (*HOLD, "scenario.recovery_od=0", "scenario.minutes=[300]", "fsync=false")
+LIGHT = ("signals.light.kind=integral", "signals.light.setpoint=1400")
+SCHEDULE = Scenario((0.5,), (80.0,), (33.2,))
+
+
+@pytest.mark.slow
+def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("WARNING"):
+        control.deploy(main.config([*WORDS, *LIGHT]), tmp_path)
+    found = rows(tmp_path)
+    minute, mean = (np.array([float(row[key]) for row in found]) for key in ("elapsed_min", "light"))
+    assert {row["light_setpoint"] for row in found} == {"1400.0"}
+    assert np.abs(mean[minute > 150.0] - 1400.0).mean() < 80.0  # it begins at 1786
+    assert {kind for row in found for kind in kinds_of(row["interlock"])} == {"light_far"}
+    assert any("light_far" in r.getMessage() and "1786" in r.getMessage() for r in caplog.records)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    (window,), told = summary["windows"], summary["reactors"]["M0"]["reasons"]
+    inside = minute < 300.0
+    assert window["light_setpoint"] == 1400.0
+    assert window["light_abs_error_mean"] == pytest.approx(np.abs(mean[inside] - 1400.0).mean())
+    assert window["light_abs_error_last2h"] < window["light_abs_error_mean"]
+    assert window["od_abs_error_mean"] < 0.02
+    assert "ratio_setpoint" not in window
+    assert told["light_far"]["first_min"] == 0.0
+    state = json.loads((tmp_path / "state.json").read_text(encoding="utf-8"))
+    assert state["light"]["mean"] == [mean[-1]]
+    assert state["light"]["law"]["integral"] != [0.0]
+    decided = [json.loads(line) for line in (tmp_path / "journal.jsonl").read_text().splitlines()]
+    assert all("thermostat_degc" in row["why"] for row in decided if row["kind"] == "decision")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
+        (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat; allowed one"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises((frame.UserError, ValueError), match=said.replace("[", r"\[")) as caught:
+        control.deploy(main.config([*WORDS, *words]), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_columns_of_every_signal_follow_one_another(tmp_path: Path) -> None:
+    setup = unpack(main.config([*WORDS, *LIGHT]), tmp_path)
+    assert setup.columns == (*USUAL, "light", "light_setpoint")
+    shares = main.config(["plant=coculture", "scenario=ratio_steps", "composition=pi"])
+    assert unpack(shares, tmp_path).columns == (*USUAL, *COLUMNS, "true_ratio")
+
+
+def test_names_and_actuators_are_used_once() -> None:
+    with pytest.raises(NameTaken):
+        signals.add("light", light.Light)
+    with pytest.raises(NameTaken):
+        signals.add("interlock", light.Light)
+    held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
+    with pytest.raises(ValueError, match="light and light act by the same thermostat"):
+        signals.fitting(held, [THERMOSTAT])
+    with pytest.raises(NameTaken):
+        agents.add("dqn", type("Other", (), {}), Any, (), "Nothing.")  # type: ignore[arg-type]
+    with pytest.raises(NameTaken):
+        tasks.add("density", type("Other", (), {}), Any, "Nothing.")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"signals\.dark: .*allowed .*light"):
+        signals.made("dark", None, [SCHEDULE])
