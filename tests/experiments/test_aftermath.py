@@ -98,18 +98,14 @@ def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, t
 
 
 @pytest.mark.slow
-def test_a_short_run_is_not_judged(tmp_path):
-    run_folder = deployed(tmp_path / "run", "controller=pi", "scenario.minutes=[8,8,8]")
-    assert "Too short to tell: " in sections(run_folder)
-
-
-@pytest.mark.slow
-def test_a_recording_that_cannot_be_compared_says_why(copy):
+def test_a_recording_that_cannot_be_compared_says_why(copy, tmp_path):
     path = copy / "recordings" / "M1.csv"
     path.write_text("\n".join(path.read_text().splitlines()[:5]) + "\n")
     text = sections(copy)
     assert text.count("Not compared: ") == 1
     assert text.count("its culture is not the model: ") == 1
+    short = deployed(tmp_path / "short", "controller=pi", "scenario.minutes=[8,8,8]")
+    assert "Too short to tell: " in sections(short)
 
 
 @pytest.mark.slow
@@ -199,17 +195,11 @@ def test_every_estimate_stands_beside_its_own_hours_and_under_its_own_heading():
 def test_facts_of_a_run_are_the_last_estimates_since_when_they_left_the_model_s_and_how_they_drift():
     """Growth is off by 10 % or more in the last two segments, that is since hour 1.5; a line through all falls."""
     drift = Drift(0.05, 0.04, -20.0, Parameter(-0.002, -0.003, -0.001), 3)
-    growth, gain, net, missed = _facts(agreed(along("growth", (0.028, 0.05, 0.04), 0.028, drift)))
-    assert growth == (
-        "growth: last 0.04 (0.036 to 0.052), the model's 0.028, which has not held since hour 1.5; a line through the "
-        "segments changes by -20 %"
-    )
-    assert gain == "gain: last 0.95 (0.855 to 1.23), the model's 1"
-    assert net == (
-        "net growth: last 0.001 (0.0009 to 0.0013), the model's 0; its interval excludes that, but in too few segments "
-        "or by less than 10 %"
-    )
-    assert missed == "the next sample was predicted within 0.0123 OD; 0.0045 OD without the error of net growth (rms)"
+    told = _facts(agreed(along("growth", (0.028, 0.05, 0.04), 0.028, drift)))
+    assert [re.findall(r"-?\d[\d.]*", line) for line in told] == [
+        ["0.04", "0.036", "0.052", "0.028", "1.5", "-20"], ["0.95", "0.855", "1.23", "1"],
+        ["0.001", "0.0009", "0.0013", "0", "10"], ["0.0123", "0.0045"],
+    ]  # fmt: skip
     level = replace(drift, slope_per_h=Parameter(-0.001, -0.003, 0.001))
     assert "a line" not in _facts(agreed(along("growth", (0.028, 0.05, 0.04), 0.028, level)))[0]
     assert _facts(agreed(along("growth", (None, None, None), 0.028)))[0] == "growth: not identifiable"
@@ -218,30 +208,22 @@ def test_facts_of_a_run_are_the_last_estimates_since_when_they_left_the_model_s_
 def test_what_interlock_and_supervisor_did_is_counted_each_by_itself():
     """Five decisions by the supervisor, two of them because of surprises; of four known errors three are within."""
     minute = np.arange(30.0)
-    why = {
-        "minute": minute,
-        "supervised": 1.0 * ((minute >= 10) & (minute < 15)),
-        "alarm": 1.0 * (abs(minute - 12.5) < 1),
-    }
+    acted, alarm = (minute >= 10) & (minute < 15), abs(minute - 12.5) < 1
+    why = {"minute": minute, "supervised": 1.0 * acted, "alarm": 1.0 * alarm}
     reasons = {
         "stale": {"rows": 3, "first_min": 31.5, "last_min": 40.0},
         "budget": {"rows": 6, "first_min": 5.0, "last_min": 8.0},
     }
     summary = {"interlock": 8, "rows": 300, "reasons": reasons}
-    assert _acted(summary, why) == (
-        "The interlock spoke in 8 of 300 rows: stale in 3 rows, minute 31.5 to 40; budget in 6 rows, minute 5 to 8. "
-        "A supervisor acted on 5 rows, minute 10 to 14, on 2 of them because readings did not fit the estimate."
-    )
+    numbers = ["8", "300", "3", "31.5", "40", "6", "5", "8", "5", "10", "14", "2"]
+    assert [number.rstrip(".") for number in re.findall(r"\d[\d.]*", _acted(summary, why))] == numbers
     day = {**summary, "reasons": {"falls": {"rows": 5, "first_min": 41.0, "last_min": 1345.0}}}
     assert ": falls in 5 rows, hour 0.7 to 22.4." in _acted(day, why)
     errors = {"error": [0.0, 0.19, 0.21, -0.1, 0.0], "error_sd": [0.1] * 5, "true_error": [0.0] * 4 + [np.nan]}
     shares = {"growth_share": [0.5] * 2, "growth_share_sd": [0.1] * 2, "true_growth_share": [0.6, 0.9]}
-    assert _sure({key: np.array(values) for key, values in errors.items()}) == [
-        "error e: within two of its own sd of the truth in 75 % of 4 decisions"
-    ]
-    assert _sure({key: np.array(values) for key, values in shares.items()}) == [
-        "growth share s: within two of its own sd of the truth in 50 % of 2 decisions"
-    ]
+    for given, name, told in ((errors, "error e", ["75", "4"]), (shares, "growth share s", ["50", "2"])):
+        (line,) = _sure({key: np.array(values) for key, values in given.items()})
+        assert (line.partition(":")[0], re.findall(r"\d+", line)) == (name, told)
 
 
 def test_decisions_of_a_reactor_are_its_own_and_what_one_of_them_lacks_is_not_known(tmp_path):

@@ -126,8 +126,12 @@ def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], 
 
 def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorded(tmp_path / "a.csv", 0.0, {27.5: 4.0, 29.0: 2.5, 31.0: 3.6, 34.5: 3.6})
-    with pytest.raises(frame.UserError, match=r"none\.csv"):
-        calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), ("none.csv",)), tmp_path)
+    for config, said in (
+        (CalibratePairConfig(), r"first=\[\]: allowed one or more recordings"),
+        (CalibratePairConfig((f"{tmp_path}/a.csv",), ("none.csv",)), r"none\.csv"),
+    ):
+        with pytest.raises(frame.UserError, match=said):
+            calibrate_pair(config, tmp_path)
     assert "a.csv: left out: 29.0 degC from minute" in caplog.text
     assert "it takes 180" in caplog.text
 
@@ -163,18 +167,6 @@ def test_light_is_that_of_the_last_hour_whatever_the_period() -> None:
     assert found.light is not None
     assert found.light.value == pytest.approx(1000.0 + 357.0 - 30.0, abs=2.0)
     assert found.growth.value == pytest.approx(0.06, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("config", "words"),
-    [
-        (CalibratePairConfig(), r"first=\[\]: allowed one or more recordings"),
-        (CalibratePairConfig(("none.csv",), ("none.csv",), mixed="x.csv"), "none.csv"),
-    ],
-)
-def test_what_cannot_be_calibrated_is_one_line(config: CalibratePairConfig, words: str, tmp_path: Path) -> None:
-    with pytest.raises(frame.UserError, match=words):
-        calibrate_pair(config, tmp_path)
 
 
 def test_a_weighted_polynomial_goes_through_what_is_known_best() -> None:
@@ -216,9 +208,7 @@ def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_
     """Four lags of 60 min and an hour behind them; 30.2 and 30.4 degC are one temperature."""
     few = [at(30.2, 0.5), at(30.4, 0.5), at(33.0, 0.6)]
     for lag, minutes in ((60.0, 300), (2.0, 180)):
-        with pytest.raises(
-            frame.UserError, match=rf"^beta: growth at 2 temperature\(s\); .* each held for {minutes} min"
-        ):
+        with pytest.raises(frame.UserError, match=rf"^beta: growth at 2 temperature\(s\); .* for {minutes} min"):
             _growth("beta", few, lag, CalibratePairConfig())
     config = CalibratePairConfig(settle_min=200.0, least_min=45.0)
     with pytest.raises(frame.UserError, match="held for 245 min"):
@@ -296,9 +286,7 @@ def test_a_pair_holds_where_both_were_recorded_and_says_by_what(tmp_path, monkey
     assert told["mixed"] is None
     assert "mixed" not in capsys.readouterr().out
     first[:] = [at(t, float(linear(t))) for t in (24.0, 26.0, 28.1)]
-    with pytest.raises(
-        frame.UserError, match=r"^recorded: alpha at 24\.0 to 28\.1 degC and beta at 28\.5 to 35\.0 degC; al"
-    ):
+    with pytest.raises(frame.UserError, match=r"^recorded: alpha at 24\.0 to 28\.1 degC and beta at 28\.5 to 35\.0 "):
         calibrate_pair(config, tmp_path)
     for wrong, said in (
         ({"names": ("x", "x")}, "names = .*: allowed two that differ"),

@@ -163,7 +163,8 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     source = written(tmp_path / "policy.npz", laws.law())
     wanted = WantedPolicy(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, 10.0, at_stake=True, forced=False)
     check = policy_check(wanted)
-    assert (check.ok, "performance" in check.detail) == (True, False)
+    assert (check.ok, "performance" in check.detail, "proven to be safe" in check.detail) == (True, False, True)
+    assert "proven to be safe" not in policy_check(replace(wanted, at_stake=False)).detail
     unpacked(source, tmp_path / "run")
     assert not caplog.messages
     bench = Bench(volume_ml=12.0)
@@ -522,22 +523,16 @@ def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run
 
 def test_what_is_told_of_a_certificate_is_what_fails_and_what_comes_closest() -> None:
     checks = (
-        Requirement("polygons", 0.0, 0.0),
-        Requirement("nominal: entry", 0.4, 1.0),
-        Requirement("noise: entry", 0.9, 1.0, "setpoint 0.4"),
-        Requirement("uncertain: entry", 0.7, 1.0),
+        Requirement("polygons", 0.0, 0.0), Requirement("nominal: entry", 0.4, 1.0),
+        Requirement("noise: entry", 0.9, 1.0, "setpoint 0.4"), Requirement("uncertain: entry", 0.7, 1.0),
         Requirement("nominal: half-width", 0.5, 0.1, kind=PERFORMANCE),
-        Requirement("noise: half-width", float("nan"), 2.0),
-        Requirement("uncertain: half-width", 0.3, 2.0),
-    )
+        Requirement("noise: half-width", float("nan"), 2.0), Requirement("uncertain: half-width", 0.3, 2.0),
+    )  # fmt: skip
     found = Certificate(None, (), checks, (), np.zeros(0), [], None, False)  # type: ignore[arg-type]
-    assert found.told() == [
-        "pass  polygons: 0, allowed 0",
-        "pass  noise: entry: 0.9, allowed 1 (setpoint 0.4); and 2 more",
-        "short  nominal: half-width: 0.5, allowed 0.1",
-        "FAIL  noise: half-width: no finite value, allowed 2",
-        "pass  uncertain: half-width: 0.3, allowed 2",
-    ]
+    told = [line.split("  ") for line in found.told()]
+    assert [word for word, _ in told] == ["pass", "pass", "short", "FAIL", "pass"]
+    assert [line for _, line in told[2:]] == [str(check) for check in checks[4:]]
+    assert told[1][1] == f"{checks[2]}; and 2 more"
     assert (found.safe, found.passed) == (False, False)
     assert ([c.value for c in found.failed(PERFORMANCE)], len(found.failed(SAFETY))) == ([0.5], 1)
 

@@ -98,15 +98,6 @@ def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
     assert math.isnan(comparison.share_row(replace(t, **short))["ratio_abs_error_last_day"])
 
 
-def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
-    vendor = made_up([[0.9, 0.6, 0.6, 0.5], [0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7]], law="pi")
-    other = made_up([[0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7], [0.9, 0.5, 0.5, 0.4]])
-    (pair,) = statistics.pairs([vendor, other], "pi")
-    assert pair["lower_in"] == 2
-    assert pair["difference"] == pytest.approx((-0.1 + 0.1 - 0.1) / 3.0)
-    assert statistics.pairs([other], "pi") == []
-
-
 def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_sensor():
     """Four kinds of vials, and laws that are off by so much less on each; whoever is told ahead meets the same ones."""
     kinds = [("inverse", False), ("pi_tuned", False), ("inverse", True), ("pi_tuned", True)]
@@ -119,16 +110,6 @@ def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_se
     assert found == pytest.approx({kind: -0.1 * (k + 1) for k, kind in enumerate(kinds)})
     elsewhere = [replace(t, cell=replace(t.cell, plant="other")) for t in trials if t.cell.controller == "pi"]
     assert statistics.pairs([t for t in trials if t.cell.controller != "pi"] + elsewhere, "pi") == []
-
-
-def test_every_law_meets_the_same_reactors_and_nothing_happens_before_a_share_is_asked_for():
-    one, other = trial("pi"), trial("proportional")
-    hour = slice(0, 30)
-    for key in ("share", "estimate", "od", "temperature"):
-        np.testing.assert_array_equal(getattr(one, key)[:, hour], getattr(other, key)[:, hour])
-    assert np.abs(one.share[:, -1] - other.share[:, -1]).max() > 1e-6
-    np.testing.assert_array_equal(one.setpoint[30:90], 0.3)
-    assert one.temperature[:, 5] == pytest.approx(33.2, abs=0.05)
 
 
 @pytest.mark.slow

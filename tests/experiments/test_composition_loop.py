@@ -152,25 +152,6 @@ def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_a
     assert minute.tolist() == [50.0] * 3  # since the program began
 
 
-def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves() -> None:
-    keeper = Scripted(ratio=0.5, target=29.0)
-    composition = held(keeper, [HOLD])
-    told = {minute: warned(composition, minute) for minute in np.arange(0.0, 260.0, 10.0)}
-    assert [minute for minute, kinds in told.items() if kinds] == list(np.arange(180.0, 260.0, 10.0))
-    assert told[250.0] == ["share_stuck"]
-    assert warned(composition, 255.0, believed=False) == []
-    (line,) = step(composition, 260.0).warnings
-    assert line.startswith("share_stuck: share 0.50, wanted 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC")
-    keeper.ratio = 0.515  # less than what counts
-    assert warned(composition, 270.0) == ["share_stuck"]
-    keeper.ratio = 0.53
-    assert warned(composition, 280.0) == []
-    assert warned(composition, 450.0) == []
-    assert warned(composition, 460.0) == ["share_stuck"]
-    keeper.answer = 30.0  # not at a limit any more
-    assert warned(composition, 470.0) == []
-
-
 def phases(minutes: tuple[float, ...], ratios: tuple[float | None, ...], announce_min: float = 0.0) -> Scenario:
     n = len(minutes)
     return Scenario((0.5,) * n, minutes, (33.2,) * n, ratios=ratios, announce_min=announce_min)
@@ -183,6 +164,9 @@ def until(end: float, *begins: float) -> list[float]:
 
 HISTORIES: dict[str, tuple[Scenario, Callable[[float], float], float, float, list[float]]] = {
     "too large: nearer is less": (HOLD, lambda t: 0.9 if t < 100 else 0.93 if t < 190 else 0.87, 36.0, 300, [180.0]),
+    "until it moves by what counts": (
+        HOLD, lambda t: 0.5 if t < 270 else 0.515 if t < 280 else 0.53, 29.0, 480, [*until(280, 180), *until(480, 460)]
+    ),
     "near": (HOLD, lambda t: 0.61, 29.0, 600, []),
     "colder than the upper limit": (HOLD, lambda t: 0.5, 35.9, 600, []),
     "warmer than the lower limit": (HOLD, lambda t: 0.5, 29.2, 600, []),

@@ -8,9 +8,7 @@ import pytest
 
 from envs.bench import Bench
 from envs.scenario import Scenario
-from envs.task import EnvConfig
 from experiments.laws.base import Array, Mask
-from experiments.laws.density.inverse import Inverse, InverseConfig
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.signals import Density, Sample
 from hardware.emulator.device import DeviceOptions
@@ -111,23 +109,6 @@ def test_a_controller_is_told_what_was_given_put_off_refused_and_repeated(looks:
     assert then in str(lab.steps[-1].notes)
     assert lab.steps[-1].rate[0] > 0.0
     assert doses.carry_ml == pytest.approx(0.0 if "no dose" in then else 0.24)
-
-
-def test_half_an_hour_without_a_dose_teaches_nothing_wrong() -> None:
-    """Growth and pump are as the model says; doses that were asked for are not given."""
-    model = EnvConfig(mu=0.025)
-    inverse = Inverse(InverseConfig(), model)
-    inverse.reset(1)
-    one, setpoint, log_od, given = np.ones(1, dtype=bool), np.array([0.8]), np.log(0.8), 0.0
-    for minute in [*range(10), *range(40, 80)]:
-        log_od += 0.025 * (30.0 if minute == 40 else 1.0) - given / 20.0
-        rate = inverse.act(np.exp([log_od]), setpoint, np.array([float(minute)]), one)
-        given = 0.0 if 9 <= minute < 43 else 60.0 * rate[0]
-        inverse.dosed(np.array([given]))
-    seen = inverse.explain()
-    assert seen["mu"][0] == pytest.approx(0.025, abs=0.001)
-    assert seen["gain"][0] == pytest.approx(1.0, abs=0.05)
-    assert np.exp(log_od) == pytest.approx(0.8, abs=0.01)
 
 
 class Turns:

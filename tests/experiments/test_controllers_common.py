@@ -6,8 +6,6 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from conf import presets
-from conf.schema import build
 from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
@@ -17,14 +15,7 @@ from experiments.coculture.base import SHARE
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Accounts, Array, Controller, Explains, Watches
-from experiments.laws.density.baselines import (
-    GainScheduled,
-    GainScheduledConfig,
-    Hold,
-    HoldConfig,
-    Threshold,
-    ThresholdConfig,
-)
+from experiments.laws.density import baselines
 from experiments.laws.density.learned import LearnedController, settings
 from experiments.laws.density.mpc import MpcConfig
 from experiments.laws.density.pso import SwarmConfig
@@ -36,9 +27,9 @@ MODEL = EnvConfig()
 KINDS = tuple(registry.KINDS)
 GIVEN = {
     "mpc": MpcConfig(swarm=SwarmConfig(particles=6, iterations=8)),
-    "threshold": ThresholdConfig(hysteresis=0.02),
-    "gain_scheduled": GainScheduledConfig(gain=(0.2, 0.7)),
-    "hold": HoldConfig(rate=0.007),
+    "threshold": baselines.ThresholdConfig(hysteresis=0.02),
+    "gain_scheduled": baselines.GainScheduledConfig(gain=(0.2, 0.7)),
+    "hold": baselines.HoldConfig(rate=0.007),
 }
 N = 6
 VOLUME_ML, GROWTH = np.linspace(12.0, 27.0, N), np.linspace(0.02, 0.035, N)
@@ -155,26 +146,17 @@ def test_reset_forgets(name: str) -> None:
     assert run() == run()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_preset_names_the_kind_and_leaves_the_rest_to_the_defaults(kind: str) -> None:
-    default = registry.config(kind)
-    assert build(default, presets.load(f"controller/{kind}")) == default
-    assert presets.load(f"controller/{kind}") == {"kind": kind}
-
-
 def test_threshold_by_hand() -> None:
-    threshold = Threshold(ThresholdConfig(rate=0.015, hysteresis=0.02))
+    threshold = baselines.Threshold(baselines.ThresholdConfig(rate=0.015, hysteresis=0.02))
     threshold.reset(1)
     path = [0.49, 0.51, 0.49, 0.481, 0.48, 0.49, 0.501]
     rates = [threshold.act(np.array([x]), np.array([0.5]), np.zeros(1), np.ones(1, dtype=bool))[0] for x in path]
     np.testing.assert_allclose(rates, [0.0, 0.015, 0.015, 0.015, 0.0, 0.0, 0.015])
 
 
-@pytest.mark.parametrize(
-    ("config", "rate"), [(HoldConfig(), 0.009), (HoldConfig(rate=0.004), 0.004), (HoldConfig(rate=0.0), 0.0)]
-)
-def test_a_constant_rate_is_the_one_that_is_asked_for_else_that_of_the_model(config: HoldConfig, rate: float) -> None:
-    hold = Hold(config, EnvConfig(mu=0.02, tau=0.45))
+@pytest.mark.parametrize(("given", "rate"), [({}, 0.009), ({"rate": 0.004}, 0.004), ({"rate": 0.0}, 0.0)])
+def test_a_constant_rate_is_the_one_that_is_asked_for_else_that_of_the_model(given, rate):
+    hold = baselines.Hold(baselines.HoldConfig(**given), EnvConfig(mu=0.02, tau=0.45))
     hold.reset(3)
     np.testing.assert_allclose(hold.act(np.ones(3), np.ones(3), np.zeros(3), np.ones(3, dtype=bool)), rate)
 
@@ -185,8 +167,8 @@ def test_a_gain_schedule_by_hand() -> None:
     The fourth vial never has a temperature; in the second sample that of the first vial is missing, and the
     third vial has no valid reading, so its temperature does not count.
     """
-    config = GainScheduledConfig(temperatures=(30.0, 37.0), mu=(0.02, 0.0375), gain=(0.25, 0.6))
-    law, yes = GainScheduled(config, EnvConfig(tau=0.45, control_min=2.0)), np.ones(4, dtype=bool)
+    config = baselines.GainScheduledConfig(temperatures=(30.0, 37.0), mu=(0.02, 0.0375), gain=(0.25, 0.6))
+    law, yes = baselines.GainScheduled(config, EnvConfig(tau=0.45, control_min=2.0)), np.ones(4, dtype=bool)
     law.reset(4)
     od, setpoint = 0.5 * np.exp([0.02, 0.04, 0.01, -0.03]), np.full(4, 0.5)
     law.watch(od, np.array([33.0, 25.0, 41.0, np.nan]), np.zeros(4), yes)
@@ -199,9 +181,9 @@ def test_a_gain_schedule_by_hand() -> None:
 
 def test_the_table_of_a_gain_schedule_rises_and_is_full() -> None:
     with pytest.raises(ValueError, match=r"controller\.temperatures"):
-        GainScheduledConfig(temperatures=(37.0, 30.0))
+        baselines.GainScheduledConfig(temperatures=(37.0, 30.0))
     with pytest.raises(ValueError, match=r"controller\.gain"):
-        GainScheduledConfig(gain=(0.5,))
+        baselines.GainScheduledConfig(gain=(0.5,))
 
 
 def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
@@ -212,7 +194,7 @@ def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
     assert taken == {"volume_ml": ["pi"], "policy": ["dqn"]}
     assert not registry.takes("pi", "policy", SHARE)
     with pytest.raises(ValueError, match="law mine: no part models"):
-        registry.add("mine", HoldConfig, Hold, "of no use", ["model", "models"])
+        registry.add("mine", baselines.HoldConfig, baselines.Hold, "of no use", ["model", "models"])
     with pytest.raises(ValueError, match=r"controller\.kind = mine"):
         registry.config("mine")
 

@@ -62,15 +62,12 @@ def refused(run: Rehearsal, *said: str) -> None:
     ("change", "why"),
     [
         ("{", "not JSON"),
-        ("", "not JSON"),
         ("[" * 100_000, "not JSON"),
         ("[]", "it holds [], expected keys and values"),
         (lambda s: s.pop("journal_row"), "journal_row: missing, expected the number of a row"),
-        (lambda s: s.update(journal_row="7"), "journal_row: 7, expected"),
         (lambda s: s.update(journal_row=True), "journal_row: True, expected"),
         (lambda s: s.update(began=5), "loop.began has shape (), this run needs (1,)"),
         (lambda s: s.update(stopped=[False] * 2), "loop.stopped has shape (2,), this run needs (1,)"),
-        (lambda s: s.pop("interlock"), "interlock: missing"),
         (lambda s: s.update(interlock=[1]), "interlock: [1]"),
         (lambda s: s["interlock"].pop("fed_ml"), "interlock: its saved state has other fields: fed_ml"),
         (lambda s: s["interlock"].update(fed_ml=["x"]), "interlock.fed_ml: ['x'], expected numbers"),
@@ -96,7 +93,6 @@ def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str
         ("sample", lambda r: r.pop("kind"), "a row without a usable kind"),
         ("intent", lambda r: r.update(sample=None), "(intent) is damaged (TypeError"),
         ("intent", lambda r: r.pop("feed_ml"), "is damaged (KeyError: 'feed_ml')"),
-        ("intent", lambda r: r.pop("waste_ml"), "(intent) is damaged (KeyError: 'waste_ml')"),
         ("intent", lambda r: r.pop("reactor"), "(intent) is damaged (KeyError: 'reactor')"),
         ("decision", lambda r: r.pop("row"), "a row of M0 is damaged (KeyError: 'row')"),
         ("decision", lambda r: r["row"].pop("od"), "a row of M0 is damaged (KeyError: 'od')"),
@@ -121,7 +117,6 @@ def test_a_journal_row_that_was_damaged(run: Rehearsal, kind: str, change: Chang
         (lambda rows: [*rows[:2], b"x" * 50 + b"\n"], "damaged near line 3"),
         (lambda rows: [*rows[:2], rows[2].replace(b",0,", b",high,", 1)], "damaged near line 3"),
         (lambda rows: [*rows[:3], b"7.5,2\n"], "damaged near line 4 (a row without a time, or not with a cell"),
-        (lambda rows: [*rows[:3], rows[3].strip() + b",1\n"], "damaged near line 4"),
         (lambda rows: [*rows[:3], b"," + rows[3].split(b",", 1)[1]], "damaged near line 4"),
         (lambda rows: [*rows[:3], b'"' + rows[3]], "damaged near line 4"),
     ],
@@ -144,19 +139,14 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
     ("content", "why"),
     [
         (b"", "it has no backend"),
-        (b"7\n", "Invalid loaded object type: int"),
         (b"[1]\n", "it holds no keys and values"),
         (b"a: [", "in line 1"),
         (b"a: *x\n", "an alias or interpolation in line 1"),
         (b"\xff\xfe\0\1", "no UTF-8 text"),
-        (b"backend: x\n", "backend = x: allowed keys and values"),
         (b"backend:\n  kind: [1]\ncontroller:\n  kind: pi\n", "backend.kind = [1]: allowed sim, chibio, emulator"),
         (b"backend:\n  kind: sim\ncontroller:\n  kind: x\n", "controller.kind = x: allowed dqn, pi, pi_tuned, mpc"),
         (b"backend:\n  kind: sim\ncontroller:\n  kind: pi\nfsync: ${nowhere}\n", "an alias or interpolation in line 5"),
-        (
-            b"backend:\n  kind: chibio\n  speed: fast\ncontroller:\n  kind: pi\n",
-            "backend.speed = fast: allowed a number",
-        ),
+        (b"backend: {kind: chibio, speed: fast}\ncontroller: {kind: pi}\n", "backend.speed = fast: allowed a number"),
     ],
 )
 def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> None:
@@ -175,12 +165,6 @@ def test_a_config_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     save_config(config, tmp_path)
     loaded = frame._stored(tmp_path / "config.yaml", "RUN", DeployConfig())
     assert (loaded.policy, loaded.resume) == ("here.npz", "RUN")
-
-
-@pytest.mark.parametrize("value", [5, [1]])
-def test_what_differs_for_one_reactor_must_be_keys_and_values(value: Any) -> None:
-    with pytest.raises(ValueError, match=r"each.M0 = .*: allowed keys and values"):
-        DeployConfig(each={"M0": value}).schedules()
 
 
 @pytest.mark.parametrize("metadata", [{"control_min": "one"}, {"control_min": None}, {"regret_pct": [1]}])

@@ -282,7 +282,7 @@ H, MIN, GOAL, SHARE, PERIODS = "time, h", "time, min", "setpoint", "growth share
 MU, TAU, GAIN, PUMP = "growth rate µ, 1/min", "dilution constant τ", "pump gain, 1 = the model's", "pump rate, µL/s"
 SORTED = "simulated recording, sorted by estimate"
 MISSED, WARM = "measured minus predicted, OD", "temperature, °C"
-INSIDE, KNOTS, MIDDLES = HOURS[2:9], [0.0, 1.0], [0.75, 2.75, 4.75]
+INSIDE, MIDDLES = HOURS[2:9], [0.75, 2.75, 4.75]
 WARMTH = np.linspace(29.0, 36.0, 141)
 FED, TWICE = [4, 12, 12] * 4, [8, 24, 24] * 4
 ONES, TENS = np.arange(90.0), np.arange(4.5, 400.0, 10.0)

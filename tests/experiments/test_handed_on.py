@@ -119,9 +119,7 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(tmp_path, monkey
         ("env_file=x.yaml", "train"): "env_file=x.yaml",
     }
     assert {(arg, command): latest.resolved(arg, command) for arg, command in told} == told
-    with pytest.raises(
-        ValueError, match=r"resume=latest: nothing of the kind under runs/; run python -m experiments\.benchmark"
-    ):
+    with pytest.raises(ValueError, match=r"resume=latest: nothing of the kind .*python -m experiments\.benchmark"):
         latest.resolved("resume=latest", "benchmark")
 
 

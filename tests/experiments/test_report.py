@@ -12,9 +12,7 @@ import subprocess
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
-from matplotlib.image import imread
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from conf import guests
@@ -30,7 +28,6 @@ from experiments.reporting.tables import Emphasis, Table, count, number, plus_mi
 from tests.experiments.test_deploy import inverse_policy
 from tests.patience import PATIENCE_S
 
-ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("report")  # its tests share a run, made once
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
@@ -90,11 +87,16 @@ class Strict(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
 
-@pytest.mark.slow
-def test_page_is_well_formed_and_points_to_nothing_outside(text):
+def well_formed(text: str) -> Strict:
     page = Strict()
     page.feed(text)
     assert page.open == []
+    return page
+
+
+@pytest.mark.slow
+def test_page_is_well_formed_and_points_to_nothing_outside(text):
+    page = well_formed(text)
     assert len(page.ids) == len(set(page.ids))
     assert page.addresses
     for address in page.addresses:
@@ -200,11 +202,10 @@ def test_in_short_a_law_without_rival_stands_beside_the_oracle_and_the_noise(ora
     best = own | {"controller": "oracle", "ise_mean": 0.16, "itae_mean": 9.0}
     page = one_section()
     comparison._in_short(page, {"beside_paper": [], "totals": [own, best][: 1 + oracle], "rows": [own]})
-    text = page.html()
-    ise, itae = ("oracle 0.16, ", "oracle 9, ") if oracle else ("", "")
-    said = f"ISE 0.17 ± 0.02 OD² min ({ise}noise 0.001), ITAE 12.6 ± 2 OD min² ({itae}noise 4.9)"
-    assert f"<li>dqn, s on p: {said}</li>" in text
-    assert "Lowest" not in text
+    (said,) = re.findall("<li>dqn, s on p: (.*)</li>", page.html())
+    ise, itae = (["0.17", "0.02", "0.16", "0.001"], ["12.6", "2", "9", "4.9"])
+    assert re.findall(r"\d[\d.]*", said) == [n for n in ise + itae if oracle or n not in ("0.16", "9")]
+    assert "Lowest" not in page.html()
 
 
 def test_numbers_that_a_verdict_has_told_are_folded_without_empty_rows_and_typeset_as_it(tmp_path):
@@ -287,9 +288,7 @@ def test_any_run_gets_a_page(tmp_path):
     charts.save(figure(), run / "figures", "both")
     figure().savefig(run / "fit.png")
     text = report.write(run).read_text(encoding="utf-8")
-    page = Strict()
-    page.feed(text)
-    assert page.open == []
+    well_formed(text)
     assert text.count("data:image/svg+xml;base64,") == 1
     assert text.count("data:image/png;base64,") == 1
     for word in ("mu.value", "0.0301", "0.02, 0.04", "x &amp; y", "both", "fit", "seed: 7", "&lt;1/min&gt;"):
@@ -306,49 +305,6 @@ def test_a_figure_is_laid_out_once_for_both_of_its_files(tmp_path, monkeypatch):
     charts.save(drawn, tmp_path, "both")
     assert layouts == [drawn]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["both.png", "both.svg"]
-
-
-def test_powers_of_ten_are_written_as_numbers(tmp_path):
-    """Episodes that cost 0.2 and 30, regrets of 0.02 and 40 %."""
-    drawn = charts.learning(-np.array([[0.2], [30.0]]), np.array([1.0, 2.0]), np.array([[0.02], [40.0]]), np.ones(1))
-    charts.save(drawn, tmp_path, "learning")
-    texts = re.findall(r">([^<>]+)</text>", (tmp_path / "learning.svg").read_text(encoding="utf-8"))
-    assert {"0.1", "1", "10"} <= set(texts)
-
-
-def test_several_runs_begin_with_what_each_came_to(tmp_path):
-    for name, passed in (("1_first", True), ("2_second", False)):
-        checks = [{"name": f"{name}'s", "holds": passed, "kind": "safety"}]
-        found = {"cannot_hold": [], "observation": [name], "passed": passed, "checks": checks}
-        run_folder(tmp_path / "both" / name, found)
-    text = re.sub(r"<[^>]*>", " ", report.write(tmp_path / "both").read_text(encoding="utf-8"))
-    order = ["Certificate of a policy for 1_first", "Good: safe", "Certificate of a policy for 2_second",
-             "Not safe: a device refuses it", "First: results", "First: what was run", "Second: results"]  # fmt: skip
-    places = [text.rindex(words) for words in order[:4]] + [text.rindex(words) for words in order[4:]]
-    assert places == sorted(places)
-    assert [text.count(words) for words in order[:4]] == [1, 1, 1, 1]
-
-
-@pytest.mark.slow
-@needs_browser
-def test_on_a_phone_no_page_scrolls_sideways_and_no_cell_is_a_column_of_letters(tmp_path):
-    api = pytest.importorskip("playwright.sync_api", reason="no playwright (python -m pip install playwright)")
-    keys = {"a_key_of_summary_json_that_is_rather_long.value": "x" * 300, "b": " ".join(["word"] * 60)}
-    wide = [{f"a column with a long heading {k}": "95 % of IQM, 1.2345 to 2.3456" for k in range(9)}]
-    run_folder(tmp_path / "run", keys | {"rows": wide})
-    page_file = report.write(tmp_path / "run")
-    with api.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 390, "height": 844})
-        page.goto(page_file.as_uri())
-        assert page.evaluate("document.documentElement.scrollWidth") == 390
-        keys_wider = "[...document.querySelectorAll('table.keys')].map(e => e.scrollWidth - e.parentNode.clientWidth)"
-        assert max(page.evaluate(keys_wider)) <= 0
-        sizes = page.evaluate(
-            "[...document.querySelectorAll('td, th')].map(e => [e.textContent.length, e.getBoundingClientRect().width])"
-        )
-        browser.close()
-    assert min(width for length, width in sizes if length > 8) > 60
 
 
 @pytest.mark.parametrize(
@@ -440,27 +396,20 @@ def test_a_sweep_is_reported_in_place_of_a_run_where_one_is_named(tmp_path, monk
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[]", ["none"]),
-        ("[1, [2, [3.5]], null]", ["1, 2, 3.5, –"]),
-        ("7", ["7"]),
-        ("null", ["–"]),
+        ("[]", ["none"]), ("[1, [2, [3.5]], null]", ["1, 2, 3.5, –"]), ("7", ["7"]), ("null", ["–"]),
         ('[{"a": 1}, {"b": {"c": "x"}}]', ["b.c", "<td>x</td>"]),
-        ('{"mixed": [{"a": 1}, 2, [3]]}', ["mixed", "a", "3"]),
-        ('{"empty": [{}], "e": {}}', ["empty"]),
+        ('{"mixed": [{"a": 1}, 2, [3]]}', ["mixed", "a", "3"]), ('{"empty": [{}], "e": {}}', ["empty"]),
         ('{"deep": {"deeper": {"deepest": [[{"a": [1]}]]}}}', ["deep.deeper.deepest"]),
-        ('{"../../out": [{"a": 1}]}', ["../../out"]),
-        ('{"a/b": [{"c": 1}]}', ["a/b"]),
+        ('{"../../out": [{"a": 1}]}', ["../../out"]), ('{"a/b": [{"c": 1}]}', ["a/b"]),
         ('{"s": Infinity, "t": NaN, "u": 1e999}', ["inf"]),
     ],
-)
+)  # fmt: skip
 def test_a_summary_of_any_shape_gets_a_page(content, words, tmp_path):
     run = tmp_path / "a" / "b" / "run"
     run.mkdir(parents=True)
     (run / "summary.json").write_text(content)
     text = report.write(run).read_text(encoding="utf-8")
-    page = Strict()
-    page.feed(text)
-    assert page.open == []
+    well_formed(text)
     for word in words:
         assert word in text
     assert {p.parent for p in tmp_path.rglob("*") if p.is_file()} <= {run, run / "tables"}
@@ -469,20 +418,15 @@ def test_a_summary_of_any_shape_gets_a_page(content, words, tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "no summary.json"),
-        ("{torn", "damaged"),
-        (b"\xff\xfe\x00", "damaged"),
-        (200_000 * "[", "damaged"),
-        ('{"half": "\\ud800"}', "damaged"),
-        ('{"beside_paper": 3}', "not the summary.json of a benchmark"),
-        ('{"beside_paper": [], "rows": {}}', "not the summary.json of a benchmark"),
+        (None, "no summary.json"), (b"{torn", "damaged"), (b"\xff\xfe\x00", "damaged"), (200_000 * b"[", "damaged"),
+        (b'{"half": "\\ud800"}', "damaged"), (b'{"beside_paper": 3}', "not the summary.json of a benchmark"),
+        (b'{"beside_paper": [], "rows": {}}', "not the summary.json of a benchmark"),
     ],
     ids=["absent", "torn", "no text", "deep", "half a character", "a number", "no rows"],
-)
+)  # fmt: skip
 def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
     if content is not None:
-        data = content.encode() if isinstance(content, str) else content
-        (tmp_path / "summary.json").write_bytes(data)
+        (tmp_path / "summary.json").write_bytes(content)
     with pytest.raises(frame.UserError, match=message):
         report.write(tmp_path)
 
@@ -593,11 +537,14 @@ def test_a_browser_shows_the_page(benchmark, tmp_path):
     assert found["drawn"] == len(found["figures"]) >= 6
     assert all(width > 300 and height > 150 for width, height in found["figures"])
 
-    picture = tmp_path / "page.png"
-    chromium(tmp_path, benchmark / "report.html", f"--screenshot={picture}")
-    image = imread(picture)[..., :3]
-    assert image.shape[1] == 1300
-    assert image[5, 5] == pytest.approx(np.array([0x0B, 0x5C, 0x8A]) / 255, abs=0.02)  # the header's colour
-    body = image[300:, :1200]
-    assert 0.02 < np.mean(body.min(axis=2) < 0.6) < 0.5  # ink on paper
-    assert len(np.unique((body[::4, ::4] * 8).astype(int).reshape(-1, 3), axis=0)) > 20  # drawn in colour
+
+def test_several_runs_begin_with_what_each_came_to(tmp_path):
+    for name, passed in (("1_first", True), ("2_second", False)):
+        checks = [{"name": f"{name}'s", "holds": passed, "kind": "safety"}]
+        found = {"cannot_hold": [], "observation": [name], "passed": passed, "checks": checks}
+        run_folder(tmp_path / "both" / name, found)
+    text = report.write(tmp_path / "both").read_text(encoding="utf-8")
+    short = text[text.index("<h2>In short") : text.index("<h2>First: results")]
+    assert re.findall("for 1_first|for 2_second|Good: |Not safe: ", short) == [
+        "for 1_first", "Good: ", "for 2_second", "Not safe: ",
+    ]  # fmt: skip

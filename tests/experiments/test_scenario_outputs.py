@@ -1,7 +1,8 @@
 """What a step gives by a spare pump: how much, by whom, never twice, never two pumps at one time."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -45,85 +46,72 @@ def test_outputs_are_read() -> None:
         Scenario(outputs=("LEDD 0.3",))
 
 
-def each(supply: Supply, minutes: range, step: Callable[[int], Any], rows: Callable[[int], Any]) -> list[Dose]:
-    """Doses of all reactors (minute, reactor, pump, mL) by the step of each and whether its reading is believed."""
+def steps(*outputs: str | None, first_min: float = 60.0) -> Scenario:
+    """A step for each of these outputs."""
+    n = len(outputs)
+    return Scenario((0.4,) * n, (first_min, 60.0)[:n], (37.0,) * n, outputs=outputs)
+
+
+def doses(supply: Supply, minutes: Iterable[float], phase: Any = 0, believed: Any = True) -> list[Dose]:
+    """Doses (minute, reactor, pump, mL); phase, believed: of all reactors, of each, or by the minute."""
     found = []
     for minute in minutes:
-        believed = np.array(rows(minute))
-        pump, ml = supply.due(np.full(believed.size, float(minute)), np.array(step(minute)), believed)
+        step, rows = (of(minute) if callable(of) else of for of in (phase, believed))
+        at, step, rows = (np.broadcast_to(v, len(supply.owed_ml)) for v in (float(minute), step, rows))
+        pump, ml = supply.due(at, step, rows)
         supply.given(pump, ml)
-        found += [(float(minute), int(n), int(pump[n]), round(float(ml[n]), 6)) for n in np.flatnonzero(ml)]
+        found += [(minute, int(n), int(pump[n]), round(float(ml[n]), 6)) for n in np.flatnonzero(ml)]
     return found
 
 
-def given(supply: Supply, minutes: range, phase: int = 0) -> list[tuple[float, int, float]]:
-    return [(minute, pump, ml) for minute, _, pump, ml in each(supply, minutes, lambda _: [phase], lambda _: [True])]
+SECOND_AT_3, SECOND_AT_4 = (lambda m: int(m >= 3)), (lambda m: int(m >= 4))
+OWED: dict[str, tuple[list[Scenario], Iterable[float], Any, Any, list[Dose]]] = {
+    "half a millilitre at a time": (
+        [steps("pump3 2 mL/h")], range(61), 0, True, [(15 * k, 0, 3, 0.5) for k in (1, 2, 3, 4)],
+    ),
+    "a volume in equal parts of at most 1.2 mL": (
+        [steps("pump4 1.5 mL"), steps("pump4 3 mL")], range(9), 0, True,
+        [(0, 0, 4, 0.75), (0, 1, 4, 1.0), (1, 0, 4, 0.75), (1, 1, 4, 1.0), (2, 1, 4, 1.0)],
+    ),
+    "in a long pause 0.5 mL of five minutes beside 0.2 of two, and nothing of an earlier step": (
+        [steps("pump3 6 mL/h", None, first_min=600.0)], [*range(3), *range(300, 305), *range(605, 620)],
+        lambda m: int(m >= 605), True, [(300, 0, 3, 0.7)],
+    ),
+    "minutes without a reading, 2 to 4 of the second, are made up for in that reactor alone": (
+        [steps("pump3 6 mL/h"), steps("pump4 3 mL/h")], range(13), 0, lambda m: [True, not 2 <= m <= 4],
+        [(5, 0, 3, 0.5), (10, 0, 3, 0.5), (10, 1, 4, 0.5)],
+    ),
+    "a volume at the first believed reading of its step": (
+        [steps("pump3 6 mL/h", "pump4 1 mL", first_min=3.0)] * 2, range(8), SECOND_AT_3,
+        lambda m: [True, m not in (3, 4)], [(3, 0, 4, 1.0), (5, 1, 4, 1.0)],
+    ),
+    "of each its own step: 0.2 mL a minute from the fifth on, and 0.05": (
+        [steps("pump3 6 mL/h", "pump4 12 mL/h", first_min=5.0), steps("pump3 3 mL/h")], range(21),
+        lambda m: [int(m >= 5), 0], True,
+        [(8, 0, 4, 0.6), (10, 1, 3, 0.5), *((m, 0, 4, 0.6) for m in (11, 14, 17, 20)), (20, 1, 3, 0.5)],
+    ),
+    "0.4 mL owed at a step's end are left out also where the next one gives by the same pump": (
+        [steps("pump3 6 mL/h", "pump3 6 mL/h", first_min=4.0)], range(15), SECOND_AT_4, True,
+        [(9, 0, 3, 0.5), (14, 0, 3, 0.5)],
+    ),
+    "of two pumps the one that owes more first": (
+        [steps("pump3 0.6 mL, pump4 1.1 mL"), steps("pump3 1.1 mL, pump4 0.6 mL")], range(4), 0, True,
+        [(0, 0, 4, 1.1), (0, 1, 3, 1.1), (1, 0, 3, 0.6), (1, 1, 4, 0.6)],
+    ),
+}  # fmt: skip
 
 
-def test_a_rate_becomes_doses_of_half_a_millilitre_and_a_volume_equal_parts() -> None:
-    """2 mL/h owe 0.5 mL every 15 min; 1.5 mL at most 1.2 at a time are 0.75 twice; 3 mL are 1 three times."""
-    hourly = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))
-    assert given(Supply([hourly], 1.2), range(61)) == [(15.0 * k, 3, 0.5) for k in (1, 2, 3, 4)]
-    once = replace(hourly, outputs=("pump4 1.5 mL",))
-    assert given(Supply([once], 1.2), range(61)) == [(0.0, 4, 0.75), (1.0, 4, 0.75)]
-    assert given(Supply([replace(hourly, outputs=("pump4 3 mL",))], 1.2), range(9)) == [(k, 4, 1.0) for k in (0, 1, 2)]
-
-
-def test_what_was_owed_in_a_long_pause_or_by_an_earlier_step_is_left_out() -> None:
-    hourly = Scenario((0.4, 0.4), (600.0, 60.0), (37.0, 37.0), outputs=("pump3 6 mL/h", None))
-    supply = Supply([hourly], 1.2)
-    assert given(supply, range(3)) == []
-    assert given(supply, range(300, 301)) == [(300.0, 3, 0.7)]  # 0.2 of two minutes and 0.5 of five
-    assert given(supply, range(301, 305)) == []
-    assert given(supply, range(605, 620), phase=1) == []
+@pytest.mark.parametrize("name", OWED)
+def test_what_a_step_gives_by_a_spare_pump_is_owed_by_its_rate_or_volume(name: str) -> None:
+    schedules, minutes, phase, believed, expected = OWED[name]
+    assert sorted(doses(Supply(schedules, 1.2), minutes, phase, believed)) == sorted(expected)
 
 
 def test_where_no_dose_may_be_decided_nothing_is_owed_or_given() -> None:
-    supply = Supply([Scenario((0.4,), (60.0,), (37.0,), outputs=("pump4 1 mL",))], 1.2)
+    supply = Supply([steps("pump4 1 mL")], 1.2)
     pump, ml = supply.due(np.array([np.nan]), np.array([-1]), np.array([False]))
     assert (pump[0], ml[0]) == (1, 0.0)
-    assert given(supply, range(2)) == [(0.0, 4, 1.0)]
-
-
-def test_minutes_without_a_believed_reading_are_made_up_for_in_that_reactor_alone() -> None:
-    """6 mL/h owe 0.1 mL a minute and 3 mL/h half of it; of both only the second's readings fail, at minutes 2 to 4."""
-    hourly = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 6 mL/h",))
-    supply = Supply([hourly, replace(hourly, outputs=("pump4 3 mL/h",))], 1.2)
-    doses = each(supply, range(13), lambda _: [0, 0], lambda minute: [True, not 2 <= minute <= 4])
-    assert doses == [(5, 0, 3, 0.5), (10, 0, 3, 0.5), (10, 1, 4, 0.5)]
-
-
-def test_a_volume_is_given_at_the_first_believed_reading_of_its_step() -> None:
-    """The step begins at minute 3, in the second reactor with two readings that are not believed."""
-    steps = Scenario((0.4, 0.4), (3.0, 60.0), (37.0, 37.0), outputs=("pump3 6 mL/h", "pump4 1 mL"))
-    supply = Supply([steps, steps], 1.2)
-    doses = each(supply, range(8), lambda minute: [int(minute >= 3)] * 2, lambda minute: [True, minute not in (3, 4)])
-    assert doses == [(3, 0, 4, 1.0), (5, 1, 4, 1.0)]
-
-
-def test_reactors_in_different_steps_are_given_what_each_one_s_step_says() -> None:
-    """At one moment the first is in its second step, the other still in its first, by another pump and rate."""
-    first = Scenario((0.4, 0.4), (5.0, 60.0), (37.0,) * 2, outputs=("pump3 6 mL/h", "pump4 12 mL/h"))
-    second = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 3 mL/h",))
-    supply = Supply([first, second], 1.2)
-    doses = each(supply, range(21), lambda minute: [int(minute >= 5), 0], lambda _: [True, True])
-    hers = [(8, 0, 4, 0.6), (11, 0, 4, 0.6), (14, 0, 4, 0.6), (17, 0, 4, 0.6), (20, 0, 4, 0.6)]  # 0.2 mL a minute
-    assert sorted(doses) == sorted([*hers, (10, 1, 3, 0.5), (20, 1, 3, 0.5)])
-
-
-def test_what_a_step_owes_at_its_end_is_left_out_also_where_the_next_one_gives_by_the_same_pump() -> None:
-    """0.1 mL a minute: 0.4 are owed at minute 4, where the second step begins, which owes a dose at minute 9."""
-    steps = Scenario((0.4, 0.4), (4.0, 60.0), (37.0,) * 2, outputs=("pump3 6 mL/h", "pump3 6 mL/h"))
-    supply = Supply([steps], 1.2)
-    assert given(supply, range(4)) == []
-    assert given(supply, range(4, 15), phase=1) == [(9.0, 3, 0.5), (14.0, 3, 0.5)]
-
-
-def test_of_two_pumps_that_owe_the_one_that_owes_more_gives_first() -> None:
-    both = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 0.6 mL, pump4 1.1 mL",))
-    assert given(Supply([both], 1.2), range(4)) == [(0.0, 4, 1.1), (1.0, 3, 0.6)]
-    other = replace(both, outputs=("pump3 1.1 mL, pump4 0.6 mL",))
-    assert given(Supply([other], 1.2), range(4)) == [(0.0, 3, 1.1), (1.0, 4, 0.6)]
+    assert doses(supply, range(2)) == [(0, 0, 4, 1.0)]
 
 
 def config(schedule: Scenario = STEPS, **flows: float) -> Any:
@@ -250,26 +238,24 @@ def test_what_the_interlock_holds_is_held_for_a_spare_pump_too(tmp_path: Path) -
 
 
 def test_a_saved_state_goes_on() -> None:
-    hourly = [Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))]
-    first, second = Supply(hourly, 1.2), Supply(hourly, 1.2)
-    given(first, range(10))
+    first, second = (Supply([steps("pump3 2 mL/h")], 1.2) for _ in range(2))
+    doses(first, range(10))
     memory.restore_rows(second, json.loads(json.dumps(memory.rows(first))), "supply")
-    assert given(second, range(10, 16)) == [(15.0, 3, 0.5)]
+    assert doses(second, range(10, 16)) == [(15, 0, 3, 0.5)]
 
 
 def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path) -> None:
-    with pytest.raises(frame.UserError, match="Pump4 has no tube; .*backend.supply.pump4_ml_s"):
-        assemble.unpack(config(pump4_ml_s=0.0), tmp_path)
     weak = config()
-    with pytest.raises(frame.UserError, match=r"bench.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"):
-        assemble.unpack(replace(weak, bench=Bench(max_rate=0.005)), tmp_path)
-    with pytest.raises(frame.UserError, match=r"bench.period_s = 75 s: allowed 60"):
-        assemble.unpack(replace(weak, bench=Bench(period_s=75.0)), tmp_path)
     slow = replace(weak, backend=SimulatedConfig(), bench=Bench(period_s=900.0))
-    with pytest.raises(frame.UserError, match=r"bench.period_s = 900 s: allowed at most"):
-        assemble.unpack(slow, tmp_path)
-    with pytest.raises(frame.UserError, match=r"pump4_ml_s: Pump4 gives at most 0.63 mL a dose"):
-        assemble.unpack(config(pump4_ml_s=0.2), tmp_path)
+    for given, said in (
+        (config(pump4_ml_s=0.0), "Pump4 has no tube; .*backend.supply.pump4_ml_s"),
+        (replace(weak, bench=Bench(max_rate=0.005)), r"bench.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"),
+        (replace(weak, bench=Bench(period_s=75.0)), r"bench.period_s = 75 s: allowed 60"),
+        (slow, r"bench.period_s = 900 s: allowed at most"),
+        (config(pump4_ml_s=0.2), r"pump4_ml_s: Pump4 gives at most 0.63 mL a dose"),
+    ):
+        with pytest.raises(frame.UserError, match=said):
+            assemble.unpack(given, tmp_path)
     with pytest.raises(ValueError, match="backend.supply = Pump3: allowed another pump"):
         ChiBioConfig(overflow_pump=OverflowPumpConfig("Pump3"), supply=SupplyConfig(pump3_ml_s=1.0))
     for flow, bias in ((2.0, 0.0), (0.1, 0.0), (1.5, 0.1)):  # the last would owe half a millilitre for ever
@@ -285,22 +271,15 @@ def test_the_declared_bias_is_taken_off_a_dose(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("/SetOutputTarget/Pump3/M0/0.050000", True),
-        ("/SetOutputOn/Pump3/1/M0", True),
-        ("/SetOutputTarget/Pump3/M0/0.060000", False),
-        ("/SetOutputTarget/Pump4/M0/0.010000", False),
-        ("/SetOutputOn/Pump4/1/M0", False),
-        ("/SetOutputOn/Pump3/2/M0", False),
+        ("Target/Pump3/M0/0.050000", True), ("On/Pump3/1/M0", True), ("Target/Pump3/M0/0.060000", False),
+        ("Target/Pump4/M0/0.010000", False), ("On/Pump4/1/M0", False), ("On/Pump3/2/M0", False),
     ],
-)
+)  # fmt: skip
 def test_the_last_gate_lets_only_declared_pumps_pass_and_only_small_doses(path: str, allowed: bool) -> None:
-    if allowed:
-        check_command(path, Permitted(("M0",), supply_pumps=("Pump3",)))
-    else:
-        with pytest.raises(DeviceStateError, match="refused"):
-            check_command(path, Permitted(("M0",), supply_pumps=("Pump3",)))
-    with pytest.raises(DeviceStateError, match="refused"):
-        check_command(path, Permitted(("M0",)))
+    for declared in (("Pump3",), ()):
+        let = nullcontext() if allowed and declared else pytest.raises(DeviceStateError, match="refused")
+        with let:
+            check_command(f"/SetOutput{path}", Permitted(("M0",), supply_pumps=declared))
 
 
 class Still:

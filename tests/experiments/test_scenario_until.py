@@ -68,9 +68,11 @@ def test_a_recovery_that_dilutes_grows_beyond_is_diluted_by_full_pump_and_surviv
     assert loop.began[1] < loop.began[0]
 
 
-def test_a_reading_that_is_not_believed_ends_nothing() -> None:
-    progress = Progress([STEPS, STEPS])
-    assert fed(progress, 5.0, 0.9, math.nan, believed=np.array([False, True])) == [False, False]
+def test_a_reading_ends_a_step_at_its_level_if_it_is_believed() -> None:
+    assert fed(Progress([STEPS, STEPS]), 5.0, 0.9, math.nan, believed=np.array([False, True])) == [False, False]
+    progress = Progress([replace(STEPS, until=("od <= 0.3", None, None))] * 2)
+    ended = [fed(progress, minute, 0.31, od) for minute, od in ((1.0, 0.31), (2.0, 0.3))]
+    assert ended == [[False, False], [False, True]]
 
 
 def test_a_step_that_begins_between_two_samples_is_asked_for_before_it_is_judged() -> None:
@@ -79,12 +81,6 @@ def test_a_step_that_begins_between_two_samples_is_asked_for_before_it_is_judged
     one = np.array([True])
     assert [fed(progress, minute, 0.75, believed=one)[0] for minute in (9.4, 10.4, 11.4)] == [False, False, True]
     assert progress.steps(0)[1] == (10.0, pytest.approx(11.4), "condition")
-
-
-def test_below_a_level() -> None:
-    progress = Progress([replace(STEPS, until=("od <= 0.3", None, None))])
-    one = np.array([True])
-    assert [fed(progress, k, od, believed=one)[0] for k, od in ((1.0, 0.31), (2.0, 0.3))] == [False, True]
 
 
 def test_settled_is_the_band_for_the_time_and_begins_anew_after_a_reading_outside() -> None:

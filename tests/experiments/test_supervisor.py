@@ -104,32 +104,26 @@ def test_the_bound_is_that_of_the_certificate_at_the_od_that_is_estimated(od: fl
 @pytest.mark.parametrize(
     ("share", "doubt", "outside"),
     [
-        (0.5, 0.09, False),
-        (0.5, 0.11, True),
+        (0.5, 0.09, False), (0.5, 0.11, True), (0.25, 0.09, False),
         (0.15, 0.0, False),  # the policy is shown 0.2, which is off by 0.05
         (0.05, 0.0, True),  # and here by 0.15
         (0.15, 0.06, True),  # it may be 0.09
-        (0.25, 0.09, False),
         (0.95, 0.0, False),  # nothing above 0.9 can be: the pump would not hold it
         (0.95, 0.12, False),  # so it is 0.83 to 0.9
-        (0.95, 0.2, True),  # 0.75 to 0.9, shown as 0.9
-        (0.88, 0.15, True),
+        (0.95, 0.2, True), (0.88, 0.15, True),  # 0.75 to 0.9, shown as 0.9
     ],
-)
+)  # fmt: skip
 def test_the_share_that_is_shown_may_be_off_by_as_much_as_was_proven(share: float, doubt: float, outside: bool) -> None:
     """By 0.1 here, between 0.2 and 0.9; a share is 0 at least and 0.9 at most."""
     assert BOUNDS is not None
-    proven = replace(BOUNDS, proven=(0.2, 0.9), growth_share=0.1)
-    law = RelativeController(POLICY, EstimatorConfig(), MODEL, proven)
-    law.reset(2)
-    law.estimator.cov[:] = 0.0
-    law.estimator.cov[1, MU, MU] = (0.5 * doubt * float(law.estimator.full_pump[1]) / MODEL.control_min) ** 2
-    observation = np.array([[0.0, 0.5], [0.0, share]])
-    assert law._outside(np.full(2, 0.5), observation).tolist() == [False, outside]
-    low = RelativeController(POLICY, EstimatorConfig(), MODEL, replace(proven, proven=(0.05, 0.9)))
-    low.reset(2)
-    low.estimator.cov[:] = law.estimator.cov
-    assert low._outside(np.full(2, 0.5), np.array([[0.0, 0.5], [0.0, 0.0]])).tolist() == [False, doubt > 0.15]
+    for proven, last, beyond in (((0.2, 0.9), share, outside), ((0.05, 0.9), 0.0, doubt > 0.15)):
+        bounds = replace(BOUNDS, proven=proven, growth_share=0.1)
+        law = RelativeController(POLICY, EstimatorConfig(), MODEL, bounds)
+        law.reset(2)
+        law.estimator.cov[:] = 0.0
+        law.estimator.cov[1, MU, MU] = (0.5 * doubt * float(law.estimator.full_pump[1]) / MODEL.control_min) ** 2
+        observation = np.array([[0.0, 0.5], [0.0, last]])
+        assert law._outside(np.full(2, 0.5), observation).tolist() == [False, beyond]
 
 
 def test_the_journal_is_told_of_each_vial_what_its_policy_saw_and_how_sure_that_was() -> None:

@@ -105,26 +105,35 @@ def _returns(folder: Path) -> list[Any]:
 
 
 def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, monkeypatch):
+    """Which is not told what the one before was."""
     monkeypatch.chdir(tmp_path)
-    begun = sweep.asked(["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.sweep.dir=old"], "train")
-    assert begun == sweep.Sweep(Path("old"), "train", ["seed=0,1", "hydra/launcher=joblib"])
+    words = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    begun = sweep.asked(["-m", *words, "hydra.sweep.dir=old"], "train")
+    assert begun == sweep.Sweep(Path("old"), "train", words)
     begun.save()
     assert sweep.asked(["resume=old", "hydra/launcher=slurm"], "train").line() == [
         "-m", "seed=0,1", "hydra/launcher=slurm", "hydra.sweep.dir=old",
     ]  # fmt: skip
-    with pytest.raises(UserError, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"):
-        sweep.asked(["-m", "resume=old", "seed=3"], "train")
-    with pytest.raises(UserError, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"):
-        sweep.asked(["-m", "seed=0,2", "hydra.sweep.dir=old"], "train").save()
+    for wrong, said in (
+        (["resume=old", "seed=3"], r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"),
+        (["seed=0,2", "hydra.sweep.dir=old"], r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*folder$"),
+    ):
+        with pytest.raises(UserError, match=said):
+            sweep.asked(["-m", *wrong], "train").save()
     sweep.asked(["-m", "seed=0,1", "hydra.sweep.dir=old"], "train").save()  # the same, by another launcher
     assert sweep.asked(["seed=0"], "train") is None
     assert sweep.asked(["+hparams_search=tuned"], "train") is not None
 
 
 def test_jobs_are_those_that_hydra_makes_of_the_command_line():
+    """A sweep goes over lists as over numbers, and leaves a list alone."""
     given = ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"]
     assert sweep.jobs(frame.normalise(given, "train")) == [
         [f"agent={agent}", f"++seed={seed}", "++env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
+    ]
+    words = ["++each.M0.minutes=[90],[60,30]", "++backend.reactors=[M0,M1]", "hydra.verbose=true"]
+    assert sweep.jobs(["-m", *words, "hydra/launcher=joblib"]) == [
+        [f"++each.M0.minutes={minutes}", "++backend.reactors=[M0,M1]"] for minutes in ("[90]", "[60,30]")
     ]
     assert sweep.jobs(["hparams_search=tuned"]) is None
     with pytest.raises(UserError, match=r"^hydra/launcher=ray: no such option; allowed: basic, joblib"):
@@ -264,14 +273,6 @@ def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_
     assert sweep.progress(swept, [*every, ["seed=4"]]).startswith("2 of 5 jobs finished")
 
 
-def test_a_sweep_goes_over_lists_as_over_numbers_and_leaves_a_list_alone() -> None:
-    words = ["++each.M0.minutes=[90],[60,30]", "++backend.reactors=[M0,M1]", "agent=paper,tuned", "hydra.verbose=true"]
-    assert sweep.jobs(["-m", *words, "hydra/launcher=joblib"]) == [
-        [f"++each.M0.minutes={minutes}", "++backend.reactors=[M0,M1]", f"agent={agent}"]
-        for minutes in ("[90]", "[60,30]") for agent in ("paper", "tuned")
-    ]  # fmt: skip
-
-
 def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothing(tmp_path: Path) -> None:
     first, second = ({"command": "train", "arguments": [f"seed={k}"]} for k in (1, 2))
     for name, content in (("a", first), ("b", second)):
@@ -279,9 +280,7 @@ def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothi
         (tmp_path / name / "sweep.json").write_text(json.dumps(content))
     found = sweep.asked(["-m", f"resume={tmp_path}/a", f"resume={tmp_path}/b"], "train")
     assert (found.folder, found.arguments) == (tmp_path / "b", ["seed=2"])
-    with pytest.raises(
-        UserError, match=r"^experiments\.deploy: a resumed sweep is python -m experiments\.train -m resume="
-    ):
+    with pytest.raises(UserError, match=r"^experiments\.deploy: .* python -m experiments\.train -m"):
         sweep.asked(["-m", f"resume={tmp_path}/a"], "deploy")
     named = sweep.asked(["-m", "hydra.sweep.dir=x", "seed=1,2", "hydra.sweep.dir=y z"], "train")
     assert (str(named.folder), named.arguments) == ("y z", ["seed=1,2"])
@@ -291,14 +290,6 @@ def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothi
     assert sweep.read(tmp_path / "a") is None
     with pytest.raises(UserError, match="no sweep; continue a single run without -m"):
         sweep.asked(["-m", f"resume={tmp_path}"], "train")
-
-
-def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
-    first = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    sweep.Sweep(tmp_path, "train", first).save()
-    again = sweep.asked(["-m", f"resume={tmp_path}", "hydra/launcher=submitit_local"], "train")
-    assert again is not None
-    assert again.arguments == ["seed=0,1", "hydra/launcher=submitit_local"]
 
 
 def test_a_cluster_without_accounting_is_said_once_by_the_log_alone(caplog, monkeypatch, tmp_path):
@@ -311,13 +302,6 @@ def test_a_cluster_without_accounting_is_said_once_by_the_log_alone(caplog, monk
     (said,) = caplog.records
     assert said.name == frame.log.name
     assert "sacct" in said.getMessage()
-
-
-def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):
-    done = run(TRAIN, "-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert "agent.learning_rat" in done.stderr
-    assert not (tmp_path / "all").exists()
 
 
 @pytest.mark.parametrize("swept", [True, False])

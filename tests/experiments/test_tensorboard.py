@@ -126,10 +126,19 @@ def test_a_population_is_told_by_the_mean_of_its_middle_half_and_by_its_ends(tmp
 
 
 @pytest.mark.slow
-def test_every_curve_and_figure_says_what_it_is(runs: Path) -> None:
+def test_every_curve_and_figure_says_what_it_is_and_configuration_and_results_stand_as_text(runs: Path) -> None:
     for events in parts(runs):
         for tag in (*scalars(events), *scalars(events, "images")):
             assert events.SummaryMetadata(tag).summary_description == described(tag) != "", tag
+    for name in RUNS:
+        texts = {tag: e for e in parts(runs / name) for tag in e.Tags()["tensors"] if tag.startswith("run/")}
+        assert set(texts) == {"run/config", "run/summary"}
+        (point,) = texts["run/config"].Tensors("run/config")
+        assert (runs / name / "config.yaml").read_text() in point.tensor_proto.string_val[0].decode()
+    (events,) = parts(runs / "dqn")
+    (image,) = events.Tensors("figures/closed_loop")
+    width, height, png = image.tensor_proto.string_val
+    assert (int(height), int(width)) == imread(io.BytesIO(png)).shape[:2]
 
 
 @pytest.mark.slow
@@ -226,15 +235,6 @@ def test_what_a_sweep_varied_is_seen_beside_runs_of_other_words(tmp_path: Path) 
     assert {m.name.tag: m.display_name for m in experiment.metric_infos} == METRICS
 
 
-@pytest.mark.slow
-def test_configuration_and_results_stand_as_text(runs: Path) -> None:
-    for name in RUNS:
-        texts = {tag: e for e in parts(runs / name) for tag in e.Tags()["tensors"] if tag.startswith("run/")}
-        assert set(texts) == {"run/config", "run/summary"}
-        (point,) = texts["run/config"].Tensors("run/config")
-        assert (runs / name / "config.yaml").read_text() in point.tensor_proto.string_val[0].decode()
-
-
 def test_a_run_can_be_watched_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A point a minute is visible at once, without a word from whoever writes; a burst of them at its end."""
     now = [0.0]
@@ -283,12 +283,3 @@ def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(
     recorded = read_recording(folder / "recordings" / "M0.csv")
     assert recorded.od.size > 9
     assert curve(events, "culture/od")[:, 0].tolist() == recorded.time_min.tolist()
-
-
-@pytest.mark.slow
-def test_a_picture_has_its_size(runs: Path) -> None:
-    (events,) = parts(runs / "dqn")
-    (image,) = events.Tensors("figures/closed_loop")
-    width, height, png = image.tensor_proto.string_val
-    assert png == (runs / "dqn" / "figures" / "closed_loop.png").read_bytes()
-    assert (int(height), int(width)) == imread(io.BytesIO(png)).shape[:2]

@@ -149,17 +149,6 @@ def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, ta
     assert [f"env.mu = {mu:g} 1/min outgrows the pump" in m for m in caplog.messages] == [True] * outgrown
 
 
-@pytest.mark.parametrize("content", [None, "mu: 0.02\ntau: zero\n", "- 1\n", "mu: [", "nu: 0.02\n", "mu: 7\n"])
-def test_a_bad_env_file_is_one_line_that_names_it(content, tmp_path):
-    path = tmp_path / "model.yaml"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(UserError, match=r"model\.yaml") as refused:
-        train_run.train(entry_point.config([f"env_file={path}"]), tmp_path / "run")
-    assert "\n" not in str(refused.value)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

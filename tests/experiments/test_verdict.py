@@ -36,24 +36,18 @@ def test_of_several_agents_the_worst_in_each_is_named_whichever_it_is() -> None:
     assert holds(myopic, "7.25 %", "0.0175 OD")
     assert said.remark.startswith("Good: ")
     assert holds(said.remark, "0.5 %", "0.003 OD")
+    for worse, words in (
+        ({"regret_pct": [0.2, 0.6]}, ("beyond the limit of 0.5 %", "within that of 0.003 OD")),
+        ({"steady_abs_error": [0.004, 0.0]}, ("within the limit of 0.5 %", "beyond that of 0.003 OD")),
+    ):
+        remark = verdict(TRAINED | worse, MODEL).remark
+        assert remark.startswith("Not good yet: ")
+        assert holds(remark, *words)
     for env, unit in (("relative", "0.0025 periods of full pump"), ("coculture", "0.0025 of the share")):
         other = verdict(found, {"env": {"kind": env}})
         assert other.items[1].endswith(unit)
         assert "env=" in other.claim
     assert other.remark == ""
-
-
-@pytest.mark.parametrize(
-    ("found", "words"),
-    [
-        ({"regret_pct": [0.2, 0.6]}, ("beyond the limit of 0.5 %", "within that of 0.003 OD")),
-        ({"steady_abs_error": [0.004, 0.0]}, ("within the limit of 0.5 %", "beyond that of 0.003 OD")),
-    ],
-)
-def test_one_agent_beyond_a_limit_is_not_good(found: dict[str, list[float]], words: tuple[str, str]) -> None:
-    said = verdict(TRAINED | found, MODEL)
-    assert said.remark.startswith("Not good yet: ")
-    assert holds(said.remark, *words)
 
 
 def test_one_agent_is_told_by_its_seed_and_a_regret_that_rounding_makes_negative_is_none() -> None:
@@ -66,19 +60,15 @@ def test_one_agent_is_told_by_its_seed_and_a_regret_that_rounding_makes_negative
 
 def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
     said = verdict(DEPLOYED, LOOP)
-    assert said.claim == "Deployment: pi held M0, M1 on the Chi.Bio for 1.5 h; completed."
+    assert holds(said.claim, "pi held M0, M1 on the Chi.Bio for 1.5 h", "completed")
     units, own = (verdict(DEPLOYED, LOOP | {"backend": {"kind": kind}}) for kind in ("pioreactor", "mine"))
     assert "on Pioreactors for" in units.claim
     assert "on the reactors of mine for" in own.claim
-    assert said.items == [
-        "largest error at rest 0.004 OD, the mean over the last 10 min of a window",
-        "fresh medium 65 mL",
-        "interlock spoke in 3 samples",
-    ]
+    assert all(map(holds, said.items, ("0.004 OD", "65 mL", "3 samples")))
     assert said.remark == "Good: 2 of 2 windows ended within 5 % of their setpoint."
     largest = [WINDOW, {"setpoint": 0.8, "steady_abs_error": 0.03}, {"setpoint": 0.6, "steady_abs_error": 0.01}]
     said = verdict(DEPLOYED | {"windows": largest}, LOOP)  # 0.03 OD is 6 % of 0.5 and less than 4 % of 0.8
-    assert said.items[0] == "largest error at rest 0.03 OD, the mean over the last 10 min of a window"
+    assert holds(said.items[0], "0.03 OD")
     assert said.remark == "Good: 3 of 3 windows ended within 5 % of their setpoint."
     away = {**WINDOW, "steady_abs_error": 0.026}  # 5 % of 0.5 is 0.025
     missing = {**WINDOW, "steady_abs_error": None}
