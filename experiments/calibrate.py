@@ -9,11 +9,11 @@ from importlib import resources
 from pathlib import Path
 
 from envs.identification.calibration import calibrate
-from envs.identification.found import Calibration
 from envs.identification.model import NotIdentifiable
 from envs.identification.refusal import growth_alone
 from envs.identification.screening import Series, merged
 from envs.identification.twin import Twin, twin
+from envs.identification.verdict import Calibration
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml, refusal, report, summary
 from experiments.calibration.study import coverage, simulated

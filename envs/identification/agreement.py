@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.identification.calibration import IdentifyConfig
-from envs.identification.drift import NOTABLE_DRIFT_PCT, Drift, Segment, cuts, drift, segments
+from envs.identification.drift import NOTABLE_DRIFT_PCT, SHORTEST_WINDOW_MIN, Drift, Segment, cuts, drift, segments
 from envs.identification.model import MIN_READINGS, Parameter
 from envs.identification.screening import OD_FLOOR, Screened, Series, screen
-from envs.identification.window import SHORTEST_WINDOW_MIN
 
 __all__ = ["Agreement", "Compared", "agreement"]
 

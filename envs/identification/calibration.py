@@ -11,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.identification.drift import NOTABLE_DRIFT_PCT, cuts, drift, segments
-from envs.identification.found import Calibration, Verdict
+from envs.identification.drift import NOTABLE_DRIFT_PCT, choose_window, drift, longest, pieces, segments
 from envs.identification.free_run import Fit, fit
 from envs.identification.model import NotIdentifiable, Parameter, check_excitation, pmse, trajectory
 from envs.identification.prediction_error import enough, estimate, outliers
 from envs.identification.refusal import check_estimate
 from envs.identification.screening import Rejection, Screened, Series, noise_sd, screen
 from envs.identification.validation import attainable_pct, validate
-from envs.identification.verdict import judged
-from envs.identification.window import choose_window, longest
+from envs.identification.verdict import Calibration, Verdict, judged
 
 __all__ = ["Calibration", "IdentifyConfig", "calibrate"]
 
@@ -134,9 +132,7 @@ def _check_between(name: str, whole: Parameter | None, alone: list[Parameter | N
 
 def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
     """Remove the readings that their segment's model contradicts."""
-    clean = screened.series
-    places = [place for first, end in screened.stretches for place in cuts(clean, first, end, config.segment_min)]
-    places = [(a, b) for a, b in places if enough(clean.part(a, b))]
+    clean, places = screened.series, pieces(screened, config.segment_min)
     bad = np.zeros(len(clean.od), dtype=np.bool_)
     found = outliers([clean.part(a, b) for a, b in places], config.seed) if places else []
     for (a, b), marked in zip(places, found, strict=True):

@@ -1,4 +1,7 @@
-"""Drift of mu and tau along a recording: separate fits of short segments, and a line through their estimates."""
+"""Drift of mu and tau along a recording: separate fits of short segments, a line through their estimates, the window.
+
+The window is the stretch of a recording for one pair (mu, tau).
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -6,18 +9,23 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.model import WIDEST, WORST_CONDITION, Parameter
+from envs.identification.model import WIDEST, WORST_CONDITION, NotIdentifiable, Parameter
 from envs.identification.noise_model import QUICK
 from envs.identification.prediction_error import enough, estimate
-from envs.identification.screening import Screened, Series
+from envs.identification.screening import FEWEST_READINGS, WEEK_MIN, Screened, Series
 
-__all__ = ["Drift", "Segment", "cuts", "drift", "drifts", "pairs", "segments"]
+__all__ = [
+    "SHORTEST_WINDOW_MIN", "Drift", "Segment", "choose_window", "cuts", "drift", "drifts", "longest", "pairs", "pieces",
+    "segments",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Pair = tuple[Parameter | None, Parameter | None]
+Window = tuple[int, int]
 
 NOTABLE_DRIFT_PCT = 10.0
 WANDERING_PCT = 33.0
+SHORTEST_WINDOW_MIN = 60.0
 SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
 
 
@@ -81,12 +89,16 @@ def cuts(clean: Series, a: int, b: int, length: float) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
+def pieces(screened: Screened, length: float) -> list[tuple[int, int]]:
+    """Cut the stretches into pieces of about `length` min, without those of too few readings for an estimate."""
+    places = (place for stretch in screened.stretches for place in cuts(screened.series, *stretch, length))
+    return [place for place in places if enough(screened.series.part(*place))]
+
+
 def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
     """Fit segments of about `length` min separately; a segment whose pump never ran gives mu only."""
-    clean = screened.series
-    places = [place for first, end in screened.stretches for place in cuts(clean, first, end, length)]
-    places = [(a, b) for a, b in places if enough(clean.part(a, b))]
-    parts = [clean.part(a, b) for a, b in places]
+    places = pieces(screened, length)
+    parts = [screened.series.part(*place) for place in places]
     return tuple(
         Segment(a, b, float(0.5 * (part.time[0] + part.time[-1])), mu, tau)
         for (a, b), part, (mu, tau) in zip(places, parts, pairs(parts), strict=True)
@@ -147,3 +159,66 @@ def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift |
     first, last = (float(level + steep * (end - middle)) for end in (t[0], t[-1]))
     slope = Parameter(steep, steep - half, steep + half)
     return Drift(first, last, 100.0 * (last / first - 1.0), slope, len(t))
+
+
+def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: float) -> tuple[Window, str]:
+    """Return positions [first, end) of the window with most readings, and the reason as text.
+
+    A window is consecutive segments of one stretch without drift, of at most a week. Windows with a segment that
+    identifies tau, and without a segment in which dilution had no effect (`_failed`), are preferred. Raises:
+    NotIdentifiable without a window of at least an hour.
+    """
+    clean = screened.series
+    failed = _failed(clean, along)
+    apart = float(np.median(np.diff(clean.time)))
+    if segment_min < FEWEST_READINGS * apart:
+        raise NotIdentifiable(
+            f"rows are {apart:.3g} min apart, and a segment of {segment_min:g} min holds {segment_min / apart:.0f}; "
+            f"allowed at least {FEWEST_READINGS}",
+            f"check the unit of time, or say identify.segment_min={2 * FEWEST_READINGS * apart:.0f}",
+        )
+    count = np.concatenate([[0], np.cumsum(np.isfinite(clean.od))])
+    best: Window | None = None
+    most = (False, 0)
+    for first, end in screened.stretches:
+        inside = tuple(s for s in along if first <= s.first and s.end <= end)
+        for i in range(len(inside)):
+            for j in range(len(inside), i, -1):
+                part, a, b = inside[i:j], inside[i].first, inside[j - 1].end
+                lasts = SHORTEST_WINDOW_MIN <= _minutes(clean, a, b) <= WEEK_MIN
+                tells = any(s.tau is not None for s in part) and not any(s in failed for s in part)
+                size = tells, int(count[b] - count[a])
+                if lasts and size > most and not drifts(part):
+                    best, most = (a, b), size
+    if best is None:
+        a, b = longest(screened)
+        raise NotIdentifiable(
+            f"the longest trustworthy stretch, rows {clean.row[a]}-{clean.row[b - 1]}, lasts "
+            f"{_minutes(clean, a, b):.0f} min; allowed at least {SHORTEST_WINDOW_MIN:.0f} min",
+            "record for longer",
+        )
+    if best in screened.stretches:
+        return best, "all trustworthy rows" if len(screened.stretches) == 1 else "the longest stretch without a pause"
+    follows = [s for s in along if s.first == best[1]]
+    capped = any(_minutes(clean, best[0], s.end) > WEEK_MIN for s in follows)
+    return best, "the longest stretch without drift" + (", of a week at most" if capped else "")
+
+
+def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
+    """Find segments of at least median pump rate that identify no tau although most of them do.
+
+    Causes are a failed feed or a collapsed culture: the recorded pump rate does not dilute.
+    """
+    pumped = [float(clean.pump_rate[s.first : s.end].mean()) for s in along]
+    busy = [s for s, rate in zip(along, pumped, strict=True) if rate >= np.median(pumped) and rate > 0.0]
+    silent = [s for s in busy if s.tau is None]
+    return silent if 2 * len(silent) < len(busy) else []
+
+
+def longest(screened: Screened) -> Window:
+    """Choose the stretch with most readings."""
+    return max(screened.stretches, key=lambda s: np.isfinite(screened.series.od[s[0] : s[1]]).sum())
+
+
+def _minutes(clean: Series, a: int, b: int) -> float:
+    return float(clean.time[b - 1] - clean.time[a])

@@ -10,15 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.model import (
-    CONFIDENCE,
-    WIDEST,
-    WORST_CONDITION,
-    NotIdentifiable,
-    Parameter,
-    pmse,
-    trajectory,
-)  # fmt: skip
+from envs.identification.model import CONFIDENCE, WIDEST, WORST_CONDITION, NotIdentifiable, Parameter, pmse, trajectory
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume
 
 __all__ = ["Fit", "fit"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from envs.identification.screening import Series, pumped_volume
 
-__all__ = ["REMEDY", "NotIdentifiable", "Parameter", "check_excitation", "pmse", "start_level", "trajectory"]
+__all__ = ["REMEDY", "NotIdentifiable", "Parameter", "check_excitation", "pmse", "trajectory"]
 
 Array = NDArray[np.float64]
 
@@ -100,9 +100,3 @@ def check_excitation(series: Series) -> None:
             f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s) in {MIN_STEPS} rows or "
             "more, so growth and dilution cannot be told apart"
         )
-
-
-def start_level(series: Series, mu: float, tau: float, readings: int = 5) -> float:
-    """Estimate the OD at the first row by a median of the first readings under known (mu, tau)."""
-    ratio = series.od / trajectory(series.time, series.pump_rate, mu, tau, 1.0)
-    return float(np.median(ratio[np.isfinite(ratio)][:readings]))

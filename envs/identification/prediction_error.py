@@ -290,7 +290,9 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
     """
     batch = _batch(parts)
     cells, solved, weight, central = _averaged(batch, rounds, seed)
-    plugged, traces = _solve(batch, central), _traces(batch, central)
+    plugged, steps = _solve(batch, central), list(_Filter(batch, central).rows())
+    variances = np.stack([step.variance[:, 0] for step in steps])
+    columns = np.stack([step.innovation[:, :, 0] for step in steps])
     sigma = np.sqrt(solved.rss / batch.degrees[:, None])
     k = solved.best[..., K] / batch.scale[:, None, K]
     k_sd = sigma * np.sqrt(np.maximum(solved.spread[..., K, K], 0.0)) / batch.scale[:, None, K]
@@ -302,10 +304,10 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
         rows, w = len(part.od), weight[m]
         inverse = _quantiles(k[m], k_sd[m], w, batch.degrees[m])
         mu = _quantiles(growth[m], growth_sd[m], w, batch.degrees[m])
-        error = traces.innovation[:rows, 0, m] - traces.innovation[:rows, 1:, m] @ plugged.best[m, 0]
+        error = columns[:rows, 0, m] - columns[:rows, 1:, m] @ plugged.best[m, 0]
         own = float(np.sqrt(plugged.rss[m, 0] / batch.degrees[m]))
         seen = batch.reading[m, :rows]
-        innovation = np.where(seen, error / (own * np.sqrt(traces.variance[:rows, m])), np.nan)
+        innovation = np.where(seen, error / (own * np.sqrt(variances[:rows, m])), np.nan)
         pumped = bool((part.pump_rate[:-1] > 0.0).any())
         diluted = np.maximum(np.abs(k[m]) * batch.rms[m], 1e-300)
         feedback = _feedback(part, innovation)
@@ -391,24 +393,6 @@ def _feedback(part: Series, innovation: Array) -> float:
     moved = change - change.mean()
     both = float(np.sqrt(np.sum(moved**2) * np.sum(z**2)))
     return float(np.sum(moved * z)) / both if both > 0.0 else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Traces:
-    """The filter at one point for each series. innovation: (n, 4, M). variance: (n, M). gain: (n, 4, M)."""
-
-    innovation: Array
-    variance: Array
-    gain: Array
-
-
-def _traces(batch: _Batch, cells: NoiseModel) -> _Traces:
-    steps = list(_Filter(batch, cells).rows())
-    return _Traces(
-        innovation=np.stack([s.innovation[:, :, 0] for s in steps]),
-        variance=np.stack([s.variance[:, 0] for s in steps]),
-        gain=np.stack([s.gain[:, :, 0] for s in steps]),
-    )
 
 
 def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envs.identification.drift import longest
 from envs.identification.model import MIN_READINGS, WORST_CONDITION, NotIdentifiable, Parameter
 from envs.identification.prediction_error import Estimate, enough, estimate
 from envs.identification.screening import OD_FLOOR, Series, noise_sd, runs, screen
 from envs.identification.validation import START_READINGS
-from envs.identification.window import longest
 
 __all__ = ["GrowthAlone", "check_estimate", "growth_alone"]
 

@@ -136,9 +136,10 @@ def row_spans(rows: NDArray[np.int64]) -> str:
     """Write row numbers as text: '3, 7-9'."""
     if not len(rows):
         return "none"
-    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    spans = [f"{p[0]}" if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts]
-    return ", ".join(spans[:6]) + (f" and {len(spans) - 6} more" if len(spans) > 6 else "")
+    parts = np.flatnonzero(np.diff(rows) > 1)
+    first, last = rows[np.append(0, parts + 1)], rows[np.append(parts, len(rows) - 1)]
+    spans = [f"{a}" if a == b else f"{a}-{b}" for a, b in zip(first[:6], last[:6], strict=True)]
+    return ", ".join(spans) + (f" and {len(first) - 6} more" if len(first) > 6 else "")
 
 
 def _slow_log_od(series: Series) -> Array:

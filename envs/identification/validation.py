@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from envs.identification.drift import cuts, pairs
-from envs.identification.model import pmse, start_level, trajectory
+from envs.identification.model import pmse, trajectory
 from envs.identification.prediction_error import Estimate, enough
 from envs.identification.screening import OD_FLOOR, Screened, Series, pumped_volume
 
@@ -17,8 +17,6 @@ __all__ = ["Ahead", "Validation", "attainable_pct", "validate"]
 Array = NDArray[np.float64]
 
 START_READINGS = 5  # readings that set the start of a prediction and are not scored
-
-
 AHEAD_MIN = (30.0, 60.0)
 SLOPE_MIN = 20.0
 
@@ -59,29 +57,24 @@ def validate(screened: Screened, window: tuple[int, int], pair: tuple[float, flo
     """Score a pair (mu in 1/min, tau), and the pair of the window's first part."""
     clean, (a, b) = screened.series, window
     cut = a + int(0.7 * (b - a))
-    before = clean.part(a, cut)
-    mu, tau = pairs([before])[0] if enough(before) else (None, None)
-    late = early = _Scored(np.empty(0), np.empty(0))
-    if mu is not None and tau is not None:
-        late = _predictions(clean, [(cut, b)], (mu.value, tau.value), horizon_min)
-        early = _predictions(clean, [(a, cut)], (mu.value, tau.value), horizon_min)
-    sides = [(first, min(end, a)) for first, end in screened.stretches]
-    sides += [(max(first, b), end) for first, end in screened.stretches]
-    outside = _predictions(clean, sides, pair, horizon_min)
-    halves = tuple(_ahead(screened))
-    return Validation(late.pmse_pct, early.pmse_pct, len(late.od), outside.pmse_pct, len(outside.od), halves)
+    first = _pair(clean.part(a, cut))
+    (late, n), (early, _) = (
+        (None, 0) if first is None else _scored(clean, [place], first, horizon_min) for place in ((cut, b), (a, cut))
+    )
+    sides = [(low, min(high, a)) for low, high in screened.stretches]
+    sides += [(max(low, b), high) for low, high in screened.stretches]
+    return Validation(late, early, n, *_scored(clean, sides, pair, horizon_min), tuple(_ahead(screened)))
 
 
 def _ahead(screened: Screened) -> Iterator[Ahead]:
     """Predict the second half by the pair of the first; a start is the median of five readings on its course."""
     clean = screened.series
     half = float(0.5 * (clean.time[0] + clean.time[-1]))
-    before = clean.part(0, int(np.searchsorted(clean.time, half)))
-    mu, tau = pairs([before])[0] if enough(before) else (None, None)
+    pair = _pair(clean.part(0, int(np.searchsorted(clean.time, half))))
     seen = np.flatnonzero(clean.od > OD_FLOOR)
-    if mu is None or tau is None or len(seen) < 2 * START_READINGS:
+    if pair is None or len(seen) < 2 * START_READINGS:
         return
-    expected = mu.value * clean.time - pumped_volume(clean.time, clean.pump_rate) / tau.value
+    expected = pair[0] * clean.time - pumped_volume(clean.time, clean.pump_rate) / pair[1]
     time, expected, od = clean.time[seen], expected[seen], clean.od[seen]
     own = np.median(sliding_window_view(np.log(od) - expected, START_READINGS), axis=1)
     level = np.append(np.full(START_READINGS - 1, np.nan), own)
@@ -113,26 +106,24 @@ def attainable_pct(found: Estimate, part: Series, horizon_min: float) -> float:
     return 100.0 * (doses + growth)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """Readings and their predictions, shape (n,)."""
-
-    od: Array
-    predicted: Array
-
-    @property
-    def pmse_pct(self) -> float | None:
-        """PMSE in %; None without scored readings."""
-        return pmse(self.od, self.predicted) if len(self.od) else None
-
-
-def _predictions(clean: Series, places: list[tuple[int, int]], pair: tuple[float, float], horizon: float) -> _Scored:
-    """Run the model freely over the places, each horizon from a start set by its first five readings."""
+def _scored(
+    clean: Series, places: list[tuple[int, int]], pair: tuple[float, float], horizon: float
+) -> tuple[float | None, int]:
+    """PMSE in % and number of readings of free runs over the places, each horizon from its first five readings."""
     od, predicted = [np.empty(0)], [np.empty(0)]
     for part in (clean.part(*cut) for place in places for cut in cuts(clean, *place, horizon)):
-        used = np.flatnonzero(np.isfinite(part.od))[START_READINGS:]
-        if len(used) >= 2 * START_READINGS:
-            model = trajectory(part.time, part.pump_rate, *pair, start_level(part, *pair, START_READINGS))
-            od.append(part.od[used])
-            predicted.append(model[used])
-    return _Scored(np.concatenate(od), np.concatenate(predicted))
+        seen = np.flatnonzero(np.isfinite(part.od))
+        if len(seen) >= 3 * START_READINGS:
+            model = trajectory(part.time, part.pump_rate, *pair, 1.0)[seen]
+            readings = part.od[seen]
+            model *= np.median((readings / model)[:START_READINGS])
+            od.append(readings[START_READINGS:])
+            predicted.append(model[START_READINGS:])
+    scored = np.concatenate(od)
+    return (pmse(scored, np.concatenate(predicted)) if len(scored) else None), len(scored)
+
+
+def _pair(part: Series) -> tuple[float, float] | None:
+    """Estimate a pair; None where a series tells none."""
+    mu, tau = pairs([part])[0] if enough(part) else (None, None)
+    return None if mu is None or tau is None else (mu.value, tau.value)

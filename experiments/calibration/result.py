@@ -8,10 +8,10 @@ import numpy as np
 from conf.schema import entries
 from envs.identification.calibration import Calibration
 from envs.identification.drift import Drift
-from envs.identification.found import Verdict
 from envs.identification.model import NotIdentifiable, Parameter
 from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
+from envs.identification.verdict import Verdict
 from envs.task import EnvConfig
 from experiments.calibration.twin_file import yaml_line
 from experiments.recordings.reader import Recording

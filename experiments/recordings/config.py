@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from conf.schema import check, require, setting
-from experiments.recordings.layout import COLUMNS, UNITS, Rows
+from experiments.recordings.layout import COLUMNS, UNITS
 from experiments.recordings.reader import Recording, read_recording
 
 __all__ = ["Source"]
@@ -52,20 +52,15 @@ class Source:
 
     def read(self, path: str) -> Recording:
         """Read a file as it is told here. Raises: RecordingError."""
+        first, end = (self.rows or ":").split(":")
         return read_recording(
             path,
             pump_ml_s=self.pump_ml_s,
             pumps=self.pumps,
             run=self.run,
             reactor=self.reactor,
-            rows=_rows(self.rows),
+            rows=(int(first or 0), int(end) if end else None),
             doses=self.doses,
             columns={key: str(name) for key, name in self.columns.items()},
             time_unit=self.time_unit,
         )
-
-
-def _rows(rows: str | None) -> Rows:
-    """FIRST:END as numbers; None is the end of the file."""
-    low, high = (rows or ":").split(":")
-    return int(low or 0), int(high) if high else None

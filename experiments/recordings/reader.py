@@ -35,8 +35,6 @@ HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
 RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch
 LISTED_RUNS = 20
 LOST_SHARE = 0.05  # more rows without a pump rate, or with one that runs backwards, are another way of working
-
-
 Doubts = tuple[tuple[str, str], ...]
 
 
@@ -112,36 +110,21 @@ def read_recording(
             layout, table = read_table(path, None if doses is None else Path(doses), asked, notes)
             doubts = _idle_pumps(layout, table, pumps, notes)
             table = _with_times_and_rates(path, table, notes)
-            highest = HIGHEST_PUMP_RATE if layout.feed == "rate" else math.inf
-            return _judged(path, layout.source, table, highest, run, notes, doubts)
+            backward = _backward(path, table, HIGHEST_PUMP_RATE if layout.feed == "rate" else math.inf)
+            _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
+            table = table.only(~backward)
+            runs = _runs(table.time_min, np.diff(table.headers, prepend=table.headers[0]) > 0)
+            keep, stale = _choose_run(path, runs, table.number, run, notes)
+            _check_spacing(path, table.time_min[keep])
+            _note(notes, table.number[stale], "time does not advance (repeated or backward): dropped")
+            ends = tuple((int(table.number[r.rows[0]]), int(table.number[r.rows[-1]])) for r in runs)
+            table = table.only(keep)
+            od = _usable_od(path, table.od, table.number, notes)
     except RecordingError as error:
         raise RecordingError(f"{error} ({'; '.join(notes)})" if notes else str(error)) from None
-
-
-def _judged(
-    path: Path, source: str, table: Cells, highest: float, run: int | None, notes: list[str], doubts: Doubts
-) -> Recording:
-    """Build the recording of rows with finite times and rates, without what cannot be used. highest: rate, mL/s."""
-    backward = _backward(path, table.pump_rate, table.number, highest)
-    _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
-    table = table.only(~backward)
-    runs = _runs(table.time_min, np.diff(table.headers, prepend=table.headers[0]) > 0)
-    keep, stale = _choose_run(path, runs, table.number, run, notes)
-    _check_spacing(path, table.time_min[keep])
-    _note(notes, table.number[stale], "time does not advance (repeated or backward): dropped")
-    ends = tuple((int(table.number[r.rows[0]]), int(table.number[r.rows[-1]])) for r in runs)
-    table = table.only(keep)
+    t, said = table, tuple(notes)
     return Recording(
-        time_min=table.time_min,
-        od=_usable_od(path, table.od, table.number, notes),
-        pump_rate=table.pump_rate,
-        temperature=table.temperature,
-        row=table.number,
-        notes=tuple(notes),
-        source=source,
-        runs=ends,
-        fluorescence=table.fluorescence,
-        doubts=doubts,
+        t.time_min, od, t.pump_rate, t.temperature, t.number, said, layout.source, ends, t.fluorescence, doubts
     )
 
 
@@ -232,15 +215,15 @@ def _choose_run(path: Path, runs: Sequence[_Run], number: Numbers, run: int | No
     return runs[chosen]
 
 
-def _backward(path: Path, pump_rate: Array, number: Numbers, highest: float) -> Mask:
+def _backward(path: Path, table: Cells, highest: float) -> Mask:
     """Rows in which the pump ran backwards, (n,). Raises: RecordingError for many, and for any impossible rate."""
-    backward = pump_rate < 0.0
+    pump_rate, backward = table.pump_rate, table.pump_rate < 0.0
     few = backward.mean() <= LOST_SHARE
     wrong = (pump_rate > highest) | (backward & ~few)
     if wrong.any():
         i = int(np.argmax(wrong))
         raise RecordingError(
-            f"{path}: row {number[i]}: pump rate {pump_rate[i]:g} mL/s: allowed 0 to {HIGHEST_PUMP_RATE:g} mL/s; "
+            f"{path}: row {table.number[i]}: pump rate {pump_rate[i]:g} mL/s: allowed 0 to {HIGHEST_PUMP_RATE:g} mL/s; "
             "a pump run backwards, or another unit such as mL/min (divide by 60)?"
         )
     return backward

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.identification.screening import row_spans
 from experiments.recordings import text
 from experiments.recordings.layout import Asked, Layout, recognised
 from hardware.errors import RecordingError
@@ -24,7 +25,6 @@ Numbers = NDArray[np.int64]
 EPOCHS = ((1e11, 6e4, "counts ms since 1970"), (1e9, 60.0, "is a date or counts s since 1970"))  # from, per min, words
 MIN_ROWS = 10
 LARGEST_ML = 50.0  # of a dose
-SHOWN = 6  # stretches of rows that a note names
 
 
 class Cells(NamedTuple):
@@ -272,8 +272,4 @@ def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> tuple
 
 def named_rows(rows: Numbers) -> str:
     """Row numbers as text, as ranges: '2 rows: 7-8'."""
-    parts = np.flatnonzero(np.diff(rows) > 1)
-    first, last = rows[np.append(0, parts + 1)], rows[np.append(parts, len(rows) - 1)]
-    spans = [f"{a}" if a == b else f"{a}-{b}" for a, b in zip(first[:SHOWN], last[:SHOWN], strict=True)]
-    shown = ", ".join(spans) + (f" and {len(first) - SHOWN} more stretches" if len(first) > SHOWN else "")
-    return f"{'row' if len(rows) == 1 else f'{len(rows)} rows:'} {shown}"
+    return f"{'row' if len(rows) == 1 else f'{len(rows)} rows:'} {row_spans(rows)}"

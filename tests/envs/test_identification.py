@@ -7,12 +7,11 @@ from scipy.optimize import minimize
 from envs.growth import DilutedCulture, Exponential
 from envs.identification.calibration import IdentifyConfig, calibrate
 from envs.identification.curves import plateaus
-from envs.identification.drift import Segment
+from envs.identification.drift import Segment, choose_window, longest
 from envs.identification.free_run import _sum_variance, fit
 from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
 from envs.identification.open_loop import OpenLoop, open_loop, recordings
 from envs.identification.screening import Screened, Series, noise_sd, pumped_volume, screen
-from envs.identification.window import choose_window, longest
 from envs.integrators import rk4
 from experiments.recordings.reader import read_recording
 from tests.real_recording import DITHER, needs_dither

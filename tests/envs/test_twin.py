@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from conf.schema import build
 from envs.identification.calibration import calibrate
-from envs.identification.found import Calibration
 from envs.identification.model import pmse
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
 from envs.identification.twin import Twin, _outliers, _Rows, twin
+from envs.identification.verdict import Calibration
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig

@@ -20,12 +20,12 @@ from envs.coculture.pair import PairConfig
 from envs.identification.agreement import Agreement, Compared
 from envs.identification.curves import Plateau
 from envs.identification.drift import Drift, Segment
-from envs.identification.found import Calibration, Verdict
 from envs.identification.model import Parameter
 from envs.identification.prediction_error import Estimate, Quality
 from envs.identification.screening import Screened, Series
 from envs.identification.twin import Course, Noise, Twin
 from envs.identification.validation import Validation
+from envs.identification.verdict import Calibration, Verdict
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification.config import CertifyConfig
