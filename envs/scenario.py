@@ -1,28 +1,121 @@
-"""Schedule of a culture: phases, each with a setpoint and a temperature."""
+"""Schedule of a culture: phases, each with a setpoint and a temperature, maybe with a condition and other fluids."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.outputs import outputs_of
-from envs.until import Condition
 
-__all__ = ["HEATED", "Scenario"]
+__all__ = [
+    "DOSE_ML", "HEATED", "MADE_UP_MIN", "PUMPS", "Conditions", "Output", "Phased", "Scenario", "bounds", "outputs_of",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LARGEST_OD = 2.0  # of a condition
+COMPARED = re.compile(r"od\s*(>=|<=)\s*(\d*\.?\d+)")
+ENDS = "'od >= 0.8', 'od <= 0.3', settled, or null: its minutes"
+
+PUMPS = (3, 4)  # spare ones: a second medium, an inducer or a stressor
+DOSE_ML = 0.5  # smallest dose: above what a pump of up to 1.5 mL/s delivers dependably (docs/device.md, Pumps)
+MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; the volume due in a longer one is omitted
+MOST_ML_H, MOST_ML = 20.0, 20.0
+GIVEN = re.compile(r"pump([34])\s+(\d*\.?\d+)\s*(mL/h|mL)", re.IGNORECASE)
+FLUIDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma between, or null"
+
+
+def bounds(text: str | None) -> tuple[float, float]:
+    """Return the OD from which, and the OD down to which a condition ends a phase; inf and -inf for none.
+
+    Args: text: "od >= LEVEL", "od <= LEVEL", "settled"; None: only its time. Raises: ValueError for any other text.
+    """
+    if text is None or text == "settled":
+        return np.inf, -np.inf
+    found = COMPARED.fullmatch(text)
+    require(found is not None, "scenario.until", repr(text), ENDS)
+    assert found is not None
+    level = float(found[2])
+    require(0.0 < level <= LARGEST_OD, "scenario.until", repr(text), f"a level with 0 < OD <= {LARGEST_OD:g}")
+    return (level, -np.inf) if found[1] == ">=" else (np.inf, level)
+
+
+class Conditions:
+    """The conditions of N reactors' steps, (N, P); rows shorter than P are padded with None.
+
+    Attributes: given, (N, P), whether there is a condition; any, whether there is one at all; texts, as written.
+    """
+
+    def __init__(self, texts: list[list[str | None]]) -> None:
+        self.texts = texts
+        self._least, self._most = np.moveaxis(np.array([[bounds(text) for text in row] for row in texts]), -1, 0)
+        self._settled = np.array([[text == "settled" for text in row] for row in texts])
+        self.given = np.array([[text is not None for text in row] for row in texts])
+        self.any = bool(self.given.any())
+
+    def met(self, phase: NDArray[np.intp], od: Array, settled: Mask) -> Mask:
+        """Return whether each reactor's step ends, (N,): OD at its level, or settled if required.
+
+        Args: phase: of each reactor, >= 0. od: nan meets no condition. settled: determined by the caller.
+        """
+        row = np.arange(phase.size)
+        reached = (od >= self._least[row, phase]) | (od <= self._most[row, phase])
+        return np.asarray(reached | (settled & self._settled[row, phase]))
+
+
+@dataclass(frozen=True)
+class Output:
+    """Output of one spare pump in a step: a volume per hour, or a volume at its start."""
+
+    pump: int
+    ml_h: float = 0.0
+    ml: float = 0.0
+
+
+def outputs_of(text: str | None) -> tuple[Output, ...]:
+    """Parse the outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed forms."""
+    found = []
+    for part in text.split(",") if text else []:
+        said = GIVEN.fullmatch(part.strip())
+        require(said is not None, "scenario.outputs", repr(text), FLUIDS)
+        assert said is not None
+        amount, hourly = float(said[2]), said[3].lower() == "ml/h"
+        low, high = (0.1, MOST_ML_H) if hourly else (DOSE_ML, MOST_ML)
+        require(low <= amount <= high, "scenario.outputs", repr(text), f"{low:g} to {high:g} {said[3]}")
+        found.append(Output(int(said[1]), amount if hourly else 0.0, 0.0 if hourly else amount))
+    pumps = [output.pump for output in found]
+    require(len(set(pumps)) == len(pumps), "scenario.outputs", repr(text), "each pump once in a step")
+    return tuple(found)
+
+
+class Phased:
+    """What has phases of a length in min."""
+
+    minutes: Sequence[float]
+
+    @property
+    def total_min(self) -> float:
+        """Length of all phases, min."""
+        return float(sum(self.minutes))
+
+    @property
+    def edges(self) -> Array:
+        """Start of each phase and the end of the last, min, shape (phases + 1,)."""
+        return np.concatenate([[0.0], np.cumsum(self.minutes)])
+
 
 HEATED: list[Callable[["Scenario"], bool]] = []
 """Whether another controller decides on the temperature of a phase that gives none; a guest adds its own."""
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Phased):
     """Consecutive phases, counted from the end of the recovery.
 
-    If `until` gives a phase a condition, its minutes are a limit, and `edges`, `phase` and `at` assume that no
+    If `until` gives a phase a condition, its minutes are a limit, and `edges` assumes that no
     condition is met (`experiments/loop/progress.py` has the actual times). Raises: ValueError with key, value and
     allowed range.
     """
@@ -72,31 +165,24 @@ class Scenario:
             "lists of {}, {} and {}".format(*lengths),
             "one or more setpoints, and as many minutes and temperatures; decimals have a point: 0.5",
         )
-        object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
-        object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
+        for name in ("until", "outputs"):
+            texts = tuple(None if each is None or each != each else str(each) for each in getattr(self, name))
+            object.__setattr__(self, name, texts)
         check(self, "scenario")
         diluted = self.recovery == "grow" or self.recovery_od > 0.0
         require(diluted, "scenario.recovery_od", self.recovery_od, "> 0 with scenario.recovery=dilute")
         given = None not in self.temperatures or any(heated(self) for heated in HEATED)
         require(given, "scenario.temperatures", self.temperatures, "numbers where nobody else decides on them")
-        for name in ("until", "outputs"):
+        for name, read in (("until", bounds), ("outputs", outputs_of)):
             self.one_each(name)
-        self._check_until()
-        for text in self.outputs:
-            outputs_of(text)
+            for text in getattr(self, name):
+                read(text)
 
     def one_each(self, name: str) -> None:
         """Check that a list is empty or has an entry for each phase. Raises: ValueError."""
         given, phases = getattr(self, name), len(self.setpoints)
         allowed = f"none or one for each of the {phases} phases"
         require(len(given) in (0, phases), f"scenario.{name}", given, allowed)
-
-    def _check_until(self) -> None:
-        for text in self.until:
-            try:
-                Condition(text)
-            except ValueError as error:
-                raise ValueError(f"scenario.until: {error}") from None
 
     @property
     def announced_min(self) -> float:
@@ -107,27 +193,3 @@ class Scenario:
     def supplied(self) -> frozenset[int]:
         """Spare pumps of all phases."""
         return frozenset(output.pump for text in self.outputs for output in outputs_of(text))
-
-    @property
-    def total_min(self) -> float:
-        """Length of all phases, min."""
-        return float(sum(self.minutes))
-
-    @property
-    def edges(self) -> Array:
-        """Start of each phase and the end of the last, min, shape (phases + 1,)."""
-        return np.concatenate([[0.0], np.cumsum(self.minutes)])
-
-    def phase(self, minute: Array) -> NDArray[np.intp]:
-        """Index of the phase at each minute; -1 before the start (and for nan), the last after the end."""
-        index = np.searchsorted(self.edges[1:], np.nan_to_num(minute, nan=-1.0) + 1e-9, side="right")
-        started = np.nan_to_num(minute, nan=-1.0) >= 0.0
-        return np.where(started, np.minimum(index, len(self.setpoints) - 1), -1).astype(np.intp)
-
-    def at(self, minute: Array) -> tuple[Array, Array]:
-        """Return setpoint and temperature at each minute since the recovery ended, each the shape of `minute`.
-
-        Before the start (minute < 0 or nan) they are those of the first phase.
-        """
-        phase = np.maximum(self.phase(minute), 0)
-        return np.asarray(self.setpoints)[phase], np.asarray(self.temperatures)[phase]

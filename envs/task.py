@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from conf.messages import NotAllowed
 from conf.schema import check, setting
-from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
 
 __all__ = ["MAX_OD", "MAX_PUMP_RATE", "SCORED_OD", "EnvConfig", "pump_rates", "step_factors", "tracking_reward"]
@@ -102,12 +101,8 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     Args: config: the task. rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
     """
     u = config.pump_rates() if rates is None else np.asarray(rates, dtype=np.float64)
-    flat = u.reshape(-1)
-    culture = DilutedCulture(Exponential(config.mu), config.tau)
-    unit = np.ones((flat.size, 2))
     advance = INTEGRATORS[config.integrator]
-    end = advance(lambda y: culture.derivative(y, flat), unit, config.control_min, config.substeps)
-    return end[:, 0].reshape(u.shape)
+    return advance(lambda x: (config.mu - u / config.tau) * x, np.ones(u.shape), config.control_min, config.substeps)
 
 
 def tracking_reward(od: T, setpoint: T) -> T:

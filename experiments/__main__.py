@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from difflib import get_close_matches
 
 from conf.presets import commands, sentence
-from experiments.cli import completion
 from experiments.cli.start import version
 
 KINDS = {
@@ -23,7 +22,6 @@ END = """\
 turbidostat COMMAND --help     what a command takes; --help=all with every value, unit, range and default
 turbidostat COMMAND --cfg job  the config it would run with
 turbidostat --version          which version this is
-eval "$(turbidostat completion bash)"     completes commands, groups and keys; also zsh and fish
 
 An emulated Chi.Bio is started by  python -m hardware.emulator --help
 
@@ -63,17 +61,9 @@ def main() -> None:
         print("\n".join(page()))
     elif name == "--version":
         print(version())
-    elif name == "completion" and len(rest) == 1 and rest[0] in completion.SHELLS:
-        print(completion.SHELLS[rest[0]], end="")
-    elif name == "complete":
-        for word in completion.candidates(" ".join(rest), names()):
-            print(word)
     elif name in names():
         sys.argv = [f"turbidostat {name}", *rest]
         importlib.import_module(f"experiments.{name}").main()
-    elif name == "completion":
-        print(f"error: completion: allowed {', '.join(completion.SHELLS)}", file=sys.stderr)
-        sys.exit(2)
     else:
         near = get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names())}"

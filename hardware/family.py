@@ -18,9 +18,8 @@ import numpy as np
 
 from conf import presets
 from envs.bench import Bench
-from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
-from envs.scenario import Scenario
+from envs.scenario import DOSE_ML, MADE_UP_MIN, Scenario
 from hardware import messages
 from hardware.actuator import FEED, SPARE, THERMOSTAT, Actuator
 from hardware.clock import run_time

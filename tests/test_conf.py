@@ -18,7 +18,7 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import __main__ as program
 from experiments import demo
-from experiments.cli import completion, frame, reference
+from experiments.cli import frame, reference
 from experiments.cli.calibrated import read_env_file
 from experiments.control.config import DeployConfig
 from experiments.deploy import main as deploy
@@ -447,27 +447,6 @@ def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
         frame.normalise([f"resume={tmp_path}/c"], "train")
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("turbidostat completion z", ["zsh"]), ("turbidostat calibrate_", ["calibrate_pump ", "calibrate_pair "]),
-        ("turbidostat deploy force_policy=", ["force_policy=true ", "force_policy=false "]),
-        ("turbidostat deploy at_end=", ["at_end=hold ", "at_end=stop ", "at_end=regulate "]),
-        ("turbidostat deploy +scenario=ratio_s", ["+scenario=ratio_sine ", "+scenario=ratio_steps "]),
-        ("turbidostat deploy safety.responses.bud", ["safety.responses.budget="]), ("turbidostat nonsense ", []),
-        ("turbidostat deploy safety.resp", ["safety.responses."]), ("turbidostat demo ", ["--help"]),
-        ("turbidostat calibrate --", ["--help", "--help=all", "--cfg", "--multirun"]),
-        ("turbidostat certify backend", []), ("turbidostat deploy backend=em", ["backend=emulator "]),
-        ("turbidostat train agent=pa", ["agent=paper "]), ("turbidostat train +env=rel", ["+env=relative "]),
-        ("turbidostat deploy plant.growth.temperature_l", ["plant.growth.temperature_law="]),
-        ("turbidostat deploy plant.growth.temperature_law=ar", ["plant.growth.temperature_law=arrhenius "]),
-        ("turbidostat deploy backend.stir", []), ("turbidostat deploy backend=chibio backend.stir", ["backend.stir="]),
-    ],
-)  # fmt: skip
-def test_a_shell_is_offered_what_fits_where_the_line_stands(line, words):
-    assert completion.candidates(line, program.names()) == words
-
-
 def test_a_command_that_no_heading_lists_stands_below_others(monkeypatch):
     monkeypatch.setattr(program, "commands", lambda: ["audit", "blank", "deploy"])
     monkeypatch.setattr(program, "sentence", lambda name: f"What {name} does.")
@@ -496,10 +475,7 @@ def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_
 @pytest.mark.parametrize(
     ("words", "said", "status"),
     [
-        (["completion", "fish"], "complete -c turbidostat -a ", None), (["completion", "zsh"], "compdef _turb", None),
-        (["completion", "ksh"], "error: completion: allowed bash, zsh, fish\n", 2),
-        (["completion"], "error: completion: allowed bash, zsh, fish\n", 2),
-        (["complete", "turbidostat", "blan"], "blank \n", None), (["-h"], "usage: turbidostat COMMAND", None),
+        (["-h"], "usage: turbidostat COMMAND", None),
         (["calibrat"], "did you mean calibrate?\n", 2), (["xyzzy"], "error: xyzzy: ", 2),
     ],
 )  # fmt: skip

@@ -1,9 +1,6 @@
 """The list of commands, the console script's words, and what a real shell completes."""
 
-import os
-import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -48,37 +45,3 @@ def test_a_command_runs_as_by_its_own_module(tmp_path: Path) -> None:
     assert ours.stdout == own.stdout != ""
     refused = run("train", "seed=-1", cwd=tmp_path)
     assert (refused.returncode, refused.stderr.startswith("error: seed = -1: ")) == (1, True)
-
-
-def test_every_command_can_be_completed() -> None:
-    listing = [name for name, *_ in listed(run().stdout)]
-    offered = run("complete", "turbidostat ").stdout.split()
-    assert offered == [*(name for name in listing if name.isidentifier()), "completion"]
-
-
-@pytest.mark.parametrize(
-    ("typed", "reply"),
-    [
-        ("turbidostat cali", ["calibrate ", "calibrate_pump ", "calibrate_pair "]),
-        ("turbidostat train agent=tu", ["tuned "]),  # bash's new word begins behind the =
-        ("turbidostat deploy plant.growth.mu_", ["plant.growth.mu_cv="]),
-    ],
-)
-def test_bash_completes(typed: str, reply: list[str], tmp_path: Path) -> None:
-    if shutil.which("bash") is None:
-        pytest.skip("no bash on this machine")
-    program = tmp_path / "turbidostat"
-    program.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m experiments "$@"\n')
-    program.chmod(0o755)
-    script = f"""
-eval "$(turbidostat completion bash)"
-COMP_LINE='{typed}' COMP_POINT={len(typed)} COMP_WORDBREAKS=$' \\t\\n"=:'
-_turbidostat
-printf '%s\\n' "${{COMPREPLY[@]}}"
-complete -p turbidostat
-"""
-    environment = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
-    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True)
-    *words, registered = done.stdout.splitlines()
-    assert words == reply, done.stderr
-    assert registered.endswith("-F _turbidostat turbidostat")

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from conf.schema import check, part, setting
 from envs.coculture.fluorescence import FluorescenceConfig, FluorescenceSensor
 from envs.coculture.pair import PairConfig
-from envs.growth import REFERENCE_TEMPERATURE
 from envs.plant.noise import Streams, spread, uniform
 from envs.plant.plant import PlantConfig
-from envs.plant.strains import TEMPERATURE_LAWS, Strain, response
+from envs.plant.strains import REFERENCE_TEMPERATURE, TEMPERATURE_LAWS, Strain, response
 
 __all__ = ["OfPlant", "SecondSpeciesConfig", "of_pair", "of_plant", "sensor", "strain"]
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.growth import Exponential, GrowthLaw, Monod
 from envs.integrators import Integrator
 from envs.plant.course import along, check_knots
 from envs.plant.strains import TEMPERATURE_LAWS, Strain
@@ -88,10 +87,7 @@ class Culture:
     def __init__(self, config: GrowthConfig, strains: Sequence[Strain], integrate: Integrator) -> None:
         self.config, self.strains, self._n = config, strains, strains[0].mu.size
         self._integrate = integrate
-        mu = np.stack([strain.mu for strain in strains], axis=1)
-        # Quoted for fresh medium: Monod's rate at s = 1 is mu_max / (1 + k_s).
-        endless = np.isinf(config.yield_od)
-        self._law: GrowthLaw = Exponential(mu) if endless else Monod(mu * (1.0 + config.k_s), config.k_s)
+        self._mu = np.stack([strain.mu for strain in strains], axis=1)
         self.mu_factor, self.stir_factor = np.ones(self._n), np.ones(self._n)
         self.strain_factor = np.ones((self._n, len(strains)))
 
@@ -157,7 +153,7 @@ class Culture:
 
         def derivative(y: Array) -> Array:
             x, s, w = y[:, :n], y[:, n : n + 1], y[:, n + 1 :]
-            rate = self._law.specific_rate(np.broadcast_to(s, x.shape)) * relative
+            rate = self._rate(s) * relative
             exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
             crowded = 1.0 - w.sum(axis=1, keepdims=True) / g.wall_capacity_od
             grown = g.wall_growth_ratio * rate * w * crowded
@@ -178,8 +174,14 @@ class Culture:
 
         Args: age_min: of the culture, min, shape (N,).
         """
-        substrate = np.broadcast_to(self.substrate[:, None], self.biomass.shape)
-        return self._law.specific_rate(substrate) * self._relative_rate(age_min)
+        return self._rate(self.substrate[:, None]) * self._relative_rate(age_min)
+
+    def _rate(self, substrate: Array) -> Array:
+        """Return rates at 37 degC, (N, S): mu, or Monod's (1949) with mu in fresh medium. Args: substrate: (N, 1)."""
+        k_s = self.config.k_s
+        if np.isinf(self.config.yield_od):
+            return self._mu
+        return np.asarray(self._mu * (1.0 + k_s) * substrate / (k_s + substrate))
 
     def _phi(self, temperature: Array) -> Array:
         """phi_i(T) of every strain, shape (N, S)."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import require, setting
-from envs.scenario import Scenario
+from envs.scenario import Phased, Scenario
 from experiments.coculture.base import Array, Wanted
 
 __all__ = ["SINE_LEAD_MIN", "Program", "Ratios", "composed", "program_of", "ratios_of", "resting"]
@@ -82,7 +82,7 @@ def program_of(scenario: Scenario) -> "Program":
 
 
 @dataclass(frozen=True)
-class Program:
+class Program(Phased):
     """Shares of the second species, one of each phase (nan: none is asked for), or a sine.
 
     sine: mean, amplitude and period in min of s(t) = mean - amplitude sin(2 pi t / period), t from the program's
@@ -103,16 +103,6 @@ class Program:
             mean, amplitude, period = self.sine
             fits = mean - abs(amplitude) > 0.0 and mean + abs(amplitude) < 1.0 and period > 0.0
             require(fits, "scenario.ratio_sine", self.sine, "mean, amplitude, period with 0 < mean +- amplitude < 1")
-
-    @property
-    def total_min(self) -> float:
-        """Length of all phases, min."""
-        return float(sum(self.minutes))
-
-    @property
-    def edges(self) -> Array:
-        """Start of each phase and the end of the last, min, (phases + 1,)."""
-        return np.concatenate([[0.0], np.cumsum(self.minutes)])
 
     @property
     def asked(self) -> bool:

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from envs.outputs import outputs_of
-from envs.scenario import Scenario
-from envs.until import Condition
+from envs.scenario import Scenario, bounds, outputs_of
 from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.assemble import Setup
@@ -65,7 +63,7 @@ def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reache
         edge = setpoint * (1.0 + math.copysign(s.settled_band, od - setpoint))
         inside = abs(od - setpoint) <= s.settled_band * setpoint
         return s.settled_min + (0.0 if inside else _reaches(od, edge, growth, dilution))
-    least, most = Condition(text).bounds
+    least, most = bounds(text)
     if od >= least or od <= most:
         return 1.0  # a step lasts a control period at least
     for level, passed in ((least, od < least <= setpoint), (most, od > most >= setpoint)):

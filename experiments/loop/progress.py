@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.scenario import Scenario
-from envs.until import Conditions
+from envs.scenario import Conditions, Scenario
 from experiments.laws.base import Array, Mask
 
 __all__ = ["CONDITION", "TIME", "Progress"]

@@ -10,8 +10,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.outputs import DOSE_ML, MADE_UP_MIN, PUMPS, outputs_of
-from envs.scenario import Scenario
+from envs.scenario import DOSE_ML, MADE_UP_MIN, PUMPS, Scenario, outputs_of
 from experiments.laws.base import Array, Mask
 
 __all__ = ["Supply"]

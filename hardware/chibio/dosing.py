@@ -25,7 +25,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`protocol.check_command`) refuses more
-DOSE_ML = 0.5  # smallest dose of a spare pump, envs/outputs.py
+DOSE_ML = 0.5  # smallest dose of a spare pump, envs/scenario.py
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 

@@ -13,7 +13,6 @@ from conf import presets
 from conf.schema import build
 from envs.bench import Bench
 from envs.coculture import task as coculture
-from envs.growth import Arrhenius, Cardinal, DilutedCulture, Exponential, Monod, relative_to_37
 from envs.gym_adapter import REGISTERED
 from envs.identification.model import trajectory
 from envs.identification.screening import pumped_volume
@@ -21,6 +20,7 @@ from envs.integrators import INTEGRATORS
 from envs.plant import disturbance
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import counts_from_od, od_from_counts
+from envs.plant.strains import response
 from envs.relative import relative_reward
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors, tracking_reward
@@ -39,7 +39,7 @@ def between(low: float, high: float, k: int) -> Array:
     return low + (high - low) * DRAW[k]
 
 
-MU, TAU, K_S, YIELD = between(0.01, 0.04, 0), between(0.2, 0.6, 1), between(0.05, 0.3, 2), between(1.0, 4.0, 3)
+MU, TAU = between(0.01, 0.04, 0), between(0.2, 0.6, 1)
 U, OD, WARM = between(0.0, 0.02, 4), between(0.1, 1.1, 5), between(4.0, 50.0, 6)
 STATE = np.stack([OD, between(0.1, 1.0, 7)], axis=1)
 HELD = between(29.0, 36.0, 8)
@@ -47,15 +47,9 @@ PREVIEW = coculture.CocultureConfig(preview_min=120.0)
 SCENARIO = Scenario((0.3, 0.6, 0.9), (10.0, 25.0, 5.0), (30.0, 37.0, 33.0), ratios=(0.3, 0.7, 0.4))
 
 
-def culture(rows: Rows, limited: bool = True) -> DilutedCulture:
-    """Rows with a rate, a yield and a flow of their own."""
-    law = Monod(MU[rows], K_S[rows]) if limited else Exponential(MU[rows])
-    return DilutedCulture(law, TAU[rows], YIELD[rows])
-
-
 def grown(name: str) -> Callable[[Rows], Any]:
     """Half an hour by an integrator."""
-    return lambda rows: INTEGRATORS[name](lambda y: culture(rows).derivative(y, U[rows]), STATE[rows], 30.0, 60)
+    return lambda rows: INTEGRATORS[name](lambda y: (MU - U / TAU)[rows, None] * y, STATE[rows], 30.0, 60)
 
 
 def mixed(rows: Rows) -> tuple[Array, ...]:
@@ -75,12 +69,7 @@ def courses(rows: Rows) -> tuple[Array, Array]:
 
 
 FUNCTIONS: dict[str, Callable[[Rows], Any]] = {
-    "exponential": lambda rows: culture(rows, limited=False).derivative(STATE[rows], U[rows]),
-    "monod": lambda rows: culture(rows).derivative(STATE[rows], U[rows]),
-    "temperature": lambda rows: (
-        relative_to_37(Arrhenius(48.0))(WARM[rows]),
-        relative_to_37(Cardinal(5.0, 39.0, 46.0))(WARM[rows]),
-    ),
+    "temperature": lambda rows: tuple(response(law, None, 48.0, 0)(WARM[rows]) for law in ("arrhenius", "cardinal")),
     **{name: grown(name) for name in INTEGRATORS},
     "counts": lambda rows: counts_from_od(OD[rows], between(9000.0, 20000.0, 8)[rows]),
     "od": lambda rows: od_from_counts(between(900.0, 20000.0, 9)[rows], between(9000.0, 20000.0, 8)[rows]),
@@ -88,10 +77,6 @@ FUNCTIONS: dict[str, Callable[[Rows], Any]] = {
     "rewards": lambda rows: (tracking_reward(OD[rows], U[rows]), relative_reward(OD[rows])),
     "recordings": courses,
     "two species": mixed,
-    "schedule": lambda rows: (
-        SCENARIO.phase(between(-5.0, 45.0, 10)[rows]),
-        *SCENARIO.at(between(-5.0, 45.0, 10)[rows]),
-    ),
 }
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from envs.outputs import Output, outputs_of
-from envs.scenario import Scenario
-from envs.until import Conditions
+from envs.scenario import Conditions, Output, Scenario, outputs_of
 from experiments.coculture.program import composed, resting
+from experiments.loop.progress import Progress
 
 STEPS = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
 
@@ -14,8 +13,8 @@ STEPS = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recov
 def test_phases_of_unequal_length_end_where_their_own_minutes_do():
     long = Scenario((0.3, 0.6, 0.9), (10.0, 25.0, 5.0), (30.0, 37.0, 33.0), outputs=("pump4 1 mL", None, None))
     minute = np.array([np.nan, -5.0, 0.0, 9.99, 10.0, 34.99, 35.0, 41.0, 500.0])
-    assert long.phase(minute).tolist() == [-1, -1, 0, 0, 1, 1, 2, 2, 2]
-    setpoint, temperature = long.at(minute)
+    phase, setpoint, temperature = Progress([long] * 9).asked(minute)
+    assert phase.tolist() == [-1, -1, 0, 0, 1, 1, 2, 2, 2]
     assert setpoint.tolist() == [0.3, 0.3, 0.3, 0.3, 0.6, 0.6, 0.9, 0.9, 0.9]
     assert temperature.tolist() == [30.0, 30.0, 30.0, 30.0, 37.0, 37.0, 33.0, 33.0, 33.0]
     assert (long.edges.tolist(), long.total_min, long.supplied) == ([0.0, 10.0, 35.0, 40.0], 40.0, {4})
@@ -30,7 +29,7 @@ def test_a_condition_has_a_level_above_zero_and_up_to_two(text, fits):
     if fits:
         assert Scenario((0.5, 0.6), (9.0, 9.0), (37.0, 37.0), until=(None, text)).until == (None, text)
     else:
-        with pytest.raises(ValueError, match=r"scenario.until: .*allowed"):
+        with pytest.raises(ValueError, match=r"scenario.until = .*allowed"):
             Scenario((0.5, 0.6), (9.0, 9.0), (37.0, 37.0), until=(None, text))
 
 

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from envs.bench import Bench
-from envs.outputs import Output, outputs_of
 from envs.plant.plant import Plant, PlantConfig
-from envs.scenario import Scenario
+from envs.scenario import Output, Scenario, outputs_of
 from experiments.cli import frame
 from experiments.control import assemble
 from experiments.loop.loop import ClosedLoop
