@@ -160,7 +160,8 @@ class Doses:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
-        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (WASTE in self.pumps.barred or self._ran_on):
+        most_ml = max(plan.waste_ml, plan.feed_ml + LATE_ML)  # of a job that ended late: its waste takes that, too
+        if 0.0 < media.high <= most_ml and not (WASTE in self.pumps.barred or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
 

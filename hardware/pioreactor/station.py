@@ -84,7 +84,7 @@ class PioreactorStation:
         self.book.log("device", device_id=self.name, url=url, flows=p.flow_ml_s, boot=p.boot, run=self.unit.run)
         self.book.log("temperature", temperature=self._target)
         yield from () if history.open else self.hear_pins()
-        self.up = True
+        self.up, self.sampling.arrived_s = True, self._clock.now()  # the first sample is waited for from now on
 
     def hear_pins(self) -> Iterator[float]:
         """Course: switch a pin, that of stirring, until the unit tells it, for at most a minute."""

@@ -158,9 +158,10 @@ class Interlock:
 
     def _collect(self, found: list[list[Fault]], findings: Sequence[Finding], now: float) -> None:
         """Add the findings to each reactor's faults; some begin a while without a dose."""
+        told = [[fault.kind for fault in faults] for faults in found]  # by the reactor, which says more
         for finding in findings:
             for i in np.flatnonzero(finding.rows):
-                found[i].append(finding.of(int(i)))
+                found[i] += [finding.of(int(i))] if finding.fault.kind not in told[i] else []
             if finding.cool is not None and self.config.response(finding.fault) is not Response.PASS:
                 pause = next(k for k, pause in enumerate(PAUSES) if pause.kind == finding.fault.kind)
                 self._hold_until_s = np.where(finding.cool, now + 60.0 * self.config.cooldown, self._hold_until_s)
