@@ -4,13 +4,13 @@ A life of the program enters each row as it writes it; a resumed one begins with
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
 from hardware.storage.doses import feeds_by
-from hardware.storage.history import History, replayed
+from hardware.storage.history import History
 
 __all__ = ["NEVER", "ReactorHistory", "Span", "replay"]
 
@@ -95,6 +95,4 @@ def _span(said: Any) -> Span:
     return NEVER if said is None else (float(said[0]), float(said[1]))
 
 
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
-    """Replay the journal of a run for each reactor. Args: rows: oldest first. Raises: RecordingError."""
-    return replayed(rows, ReactorHistory())
+replay = ReactorHistory.replay

@@ -18,7 +18,7 @@ from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, PUMPS, DeviceState
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.stations import Newest
+from hardware.stations import Station
 
 __all__ = ["ChibioStation"]
 
@@ -29,21 +29,20 @@ STARTS = 3  # attempts to start an experiment before it counts as failed
 AGAIN_S = 60.0  # from a restart that failed to the next one
 
 
-class ChibioStation:
+class ChibioStation(Station):
     """One reactor under control.
 
-    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; regulated_od, OD at which it was handed over to
-      the on-board regulation, nan while this program controls; busy, while the reactor is being started or recovered;
-      restored, whether it goes on from what an earlier life left.
+    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; busy, while the reactor is being started or
+      recovered; restored, whether it goes on from what an earlier life left.
     """
 
     def __init__(self, context: Context) -> None:
         self.connection, self.book = connection, book = context.connection, context.book
+        self.name = connection.name
         self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
         self._volume_ml, self._past, self._clock = context.volume_ml, context.past, connection.clock
         self.sampling = Sampling(self._config, self._clock)
         self.doses = DoseSequence(context)
-        self.regulated_od = math.nan
         self.overflow_pump = OverflowPump(connection, self._config.overflow_pump, book)
         self.fluorescence = Fluorescence(connection, self._config.fluorescence, book)
         self.busy = self.restored = False
@@ -53,28 +52,6 @@ class ChibioStation:
         self._target_c = self._config.temperature
         self._heat = True
         self._blank = math.nan
-
-    @property
-    def name(self) -> str:
-        """Position, M0 to M7."""
-        return self.connection.name
-
-    @property
-    def newest(self) -> Newest:
-        """Its newest sample."""
-        s = self.sampling
-        light = s.fluorescence if self._config.fluorescence.measure else None
-        return Newest(s.at, s.od, s.temperature, s.raw, s.arrived_s, s.blank, light)
-
-    @property
-    def next_look(self) -> float:
-        """Clock time of the next look."""
-        return self.sampling.next_poll
-
-    @property
-    def handed_over(self) -> bool:
-        """Whether the on-board regulation has it."""
-        return math.isfinite(self.regulated_od)
 
     # ------------------------------------------------------------------------------------------- start and recovery
 
@@ -128,7 +105,7 @@ class ChibioStation:
             if self.handed_over:
                 self._hand_over_again()
             state = self._keep_on(self.connection.read())
-            self.sampling.arrived_s = self.sampling.next_poll = self._clock.now()
+            self.sampling.arrived_s = self.sampling.next_look = self._clock.now()
             self.book.log(
                 "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
                 start_time=state.start_time,
@@ -225,7 +202,7 @@ class ChibioStation:
 
     def poll(self) -> bool:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
-        self.sampling.next_poll = self._clock.now() + self._config.retry_s
+        self.sampling.next_look = self._clock.now() + self._config.retry_s
         try:
             if not self.restored:
                 if not self.busy:
@@ -292,8 +269,9 @@ class ChibioStation:
         sampling, self._restarts = self.sampling, 0
         if note := sampling.take(state, now):
             self.book.tell(note)
-        sampling.fluorescence = self.fluorescence.reading(state)
-        light = {"fluorescence": sampling.fluorescence} if self._config.fluorescence.measure else {}
+        if self._config.fluorescence.measure:
+            sampling.fluorescence = self.fluorescence.reading(state)
+        light = {} if sampling.fluorescence is None else {"fluorescence": sampling.fluorescence}
         self.book.log(
             "sample", sample=sampling.key, od=sampling.od, temperature=sampling.temperature, raw=sampling.raw,
             blank=state.blank, late_s=sampling.late_s, read_s=self.connection.took_s, **light,

@@ -5,7 +5,7 @@ on record with the least and the most, and what was booked otherwise when it beg
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -18,8 +18,8 @@ from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
 from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
 from hardware.stations import Plan
-from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given, feeds_by
+from hardware.storage.history import History
 
 __all__ = ["Doses", "UnitHistory", "replay"]
 
@@ -28,7 +28,7 @@ DRAINS = 5  # attempts to empty a vial after that
 
 
 @dataclass(frozen=True)
-class UnitHistory(history_of.History):
+class UnitHistory(History):
     """One unit's past; boot, when it had been started; of an open dose pump, id and task, the answer to its request."""
 
     boot: str = ""
@@ -36,8 +36,8 @@ class UnitHistory(history_of.History):
     id: str = ""
     task: str = ""
 
-    KINDS: ClassVar = (*history_of.History.KINDS, "task")
-    KEYS: ClassVar = {**history_of.History.KEYS, "boot": str}
+    KINDS: ClassVar = (*History.KINDS, "task")
+    KEYS: ClassVar = {**History.KEYS, "boot": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
         """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
@@ -49,9 +49,7 @@ class UnitHistory(history_of.History):
         return known
 
 
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, UnitHistory]:
-    """Replay the journal of a run for each unit. Args: rows: oldest first. Raises: RecordingError."""
-    return history_of.replayed(rows, UnitHistory())
+replay = UnitHistory.replay
 
 
 class Doses:

@@ -18,7 +18,7 @@ from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts, regulates, request, target_of
 from hardware.pioreactor.web import Barrier, Calls
-from hardware.stations import Newest, Plan
+from hardware.stations import Plan, Station
 
 __all__ = ["PioreactorStation"]
 
@@ -30,14 +30,11 @@ PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
-class PioreactorStation:
+class PioreactorStation(Station):
     """One unit of a cluster.
 
-    Attributes: regulated_od, OD at which the vendor's turbidostat was started, nan if it was not; level_ml, that the
-      unit's own ledger is to be put to, nan if it is not; up, whether it was brought up; next_look, which is always.
+    Attributes: level_ml, that the unit's own ledger is to be put to, nan if it is not; up, whether it was brought up.
     """
-
-    next_look = -math.inf
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.name, self.book, self._web = unit, unit.name, unit.book, unit.web
@@ -47,7 +44,7 @@ class PioreactorStation:
         self.doses = Doses(self._pumps)
         self._answer = self._pumps.answer
         self.sampling = UnitSampling(unit.config, unit.bench.period_s, self._clock.now())
-        self.regulated_od = self._target = self.level_ml = math.nan
+        self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = self._listened = False
         self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
         self._course: Iterator[float] | None = None
@@ -168,22 +165,12 @@ class PioreactorStation:
         undisturbed_s = self._clock.of_real(self.doses.ended_s) + self._config.mix_s
         dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
         is_new, s = not dosing and self.sampling.look(self._clock.now(), undisturbed_s), self.sampling
+        s.temperature = c = self._box.temperature
         self.book.report(self._wrong())
         if is_new:
-            t, c = self.book.elapsed() - self._clock.now() + s.at, self._box.temperature
+            t = self.book.elapsed() - self._clock.now() + s.at
             self.book.log("sample", sample_s=round(t, 3), od=s.od, spread=s.spread, readings=s.number, temperature=c)
         return is_new
-
-    @property
-    def newest(self) -> Newest:
-        """Its newest sample."""
-        s = self.sampling
-        return Newest(s.at, s.od, self._box.temperature, s.raw, s.arrived_s)
-
-    @property
-    def handed_over(self) -> bool:
-        """Whether the vendor's turbidostat has it."""
-        return math.isfinite(self.regulated_od)
 
     def _wrong(self) -> Fault | None:
         """Return what is wrong now."""
