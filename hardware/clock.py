@@ -30,11 +30,9 @@ class RealClock:
         self._start = uptime()
 
     def now(self) -> float:
-        """Real seconds."""
         return uptime() - self._start
 
     def sleep(self, seconds: float) -> None:
-        """Wait real seconds."""
         if seconds > 0.0:
             time.sleep(seconds)
 
@@ -54,11 +52,9 @@ class DeviceClock:
         self.real, self._speed = real or RealClock(), speed
 
     def now(self) -> float:
-        """Device seconds."""
         return self.of_real(self.real.now())
 
     def sleep(self, seconds: float) -> None:
-        """Wait device seconds."""
         self.real.sleep(self.to_real(seconds))
 
     def of_real(self, real_s: float) -> float:
@@ -77,11 +73,9 @@ class VirtualClock:
         self._now = start
 
     def now(self) -> float:
-        """Virtual seconds."""
         return self._now
 
     def sleep(self, seconds: float) -> None:
-        """Advance virtual time."""
         if seconds > 0.0:
             self._now += seconds
 

@@ -98,7 +98,6 @@ class Opening:
 
     @property
     def began(self) -> float:
-        """When the run began, s since 1970."""
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
     def elapsed_s(self, speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf) -> float:
@@ -219,7 +218,6 @@ class Family:
         return None
 
     def sees_fluorescence(self, backend: Any) -> bool:
-        """Whether a device is told to measure fluorescence."""
         return False
 
     def seeing_fluorescence(self, backend: Any) -> Any:
@@ -251,7 +249,6 @@ class Family:
 
 
 def _looked_at(reactors: Reactor) -> Iterator[Check]:
-    """Take a sample of each reactor, and verify its pumps off. Raises: ReactorError."""
     n = len(reactors.names)
     yield Check("reactors", True, f"{', '.join(reactors.names)} opened")
     try:
@@ -294,7 +291,6 @@ _loaded: dict[str, Family] = {}
 
 
 def known() -> list[str]:
-    """List the name of every kind."""
     return list(dict.fromkeys([*SHIPPED, *_loaded]))
 
 
@@ -308,7 +304,6 @@ def family(kind: str) -> Family:
 
 
 def family_of(backend: Any) -> Family:
-    """Return the family that a backend's config is of."""
     return family(backend.kind)
 
 

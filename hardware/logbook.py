@@ -15,8 +15,7 @@ Log = Callable[[str, Mapping[str, Any]], None]
 screen = logging.getLogger(__name__)
 
 
-def no_log(kind: str, fields: Mapping[str, Any]) -> None:
-    """Keep nothing."""
+def no_log(kind: str, fields: Mapping[str, Any]) -> None: ...
 
 
 class Logbook:
@@ -38,7 +37,6 @@ class Logbook:
         self._log, self._write = log, write
 
     def log(self, kind: str, **fields: Any) -> None:
-        """Write a row."""
         self._log(kind, {"reactor": self.name, **fields})
 
     def write(self, kind: str, **fields: Any) -> None:

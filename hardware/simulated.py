@@ -51,7 +51,6 @@ class SimulatedReactors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """As configured."""
         return self.config.reactors
 
     def measure(self) -> Measurement:
@@ -70,7 +69,6 @@ class SimulatedReactors:
         )
 
     def actuate(self, command: Command) -> Receipt:
-        """Dose once within the coming control period. Raises: nothing."""
         volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.control_min
         self._feed_s = volume / self.config.pump_ml_s
         asked = command.rows & ~np.isnan(command.temperature)
@@ -78,11 +76,9 @@ class SimulatedReactors:
         return Receipt(volume_ml=volume)
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """None ever is."""
         return []
 
     def elapsed(self) -> float:
-        """Run time, s."""
         return 60.0 * self._minutes
 
     def pumps_off(self, rows: Mask) -> list[str]:
@@ -92,11 +88,9 @@ class SimulatedReactors:
 
     @property
     def handed_over(self) -> Mask:
-        """None ever is."""
         return np.zeros(self.plant.n, dtype=np.bool_)
 
     def give_up(self, rows: Mask) -> list[str]:
-        """As `pumps_off`."""
         return self.pumps_off(rows)
 
     def heat_off(self, rows: Mask) -> list[str]:
@@ -105,7 +99,6 @@ class SimulatedReactors:
         return []
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """There is no device that could regulate by itself."""
         self.pumps_off(rows)
         return [
             f"{name}: no on-board regulation in simulation, pumps off"
@@ -114,7 +107,6 @@ class SimulatedReactors:
         ]
 
     def stop(self) -> None:
-        """No dose is pending any more."""
         self._feed_s = np.zeros(self.plant.n)
 
 
@@ -129,28 +121,23 @@ class SimulatedFamily(Family):
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:
-        """Vials of `opening.plant`."""
         backend, bench = opening.backend, opening.bench
         volumes_ml = bench.volumes(backend.reactors)
         vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed), volumes_ml)
         yield SimulatedReactors(vials, backend, bench.control_min)
 
     def vials(self, backend: SimulatedConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
-        """Those of deploy's `plant`."""
         return "plant", plant
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """Return the vials themselves, and `pump_ml_s`."""
         if not isinstance(reactors, SimulatedReactors):
             return None, 1.0
         return reactors.plant, reactors.config.pump_ml_s
 
     def address(self, backend: SimulatedConfig) -> str:
-        """In this process."""
         return "in this computer"
 
     def start_od(self, backend: SimulatedConfig, plant: PlantConfig) -> float:
-        """Return the start OD of the vials."""
         return plant.start_od
 
 

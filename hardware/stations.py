@@ -103,16 +103,13 @@ class Stations(Generic[S, H]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One per reactor, e.g. ("M0", "M1")."""
         return tuple(station.name for station in self.stations)
 
     @property
     def handed_over(self) -> Mask:
-        """Reactors that the device's own regulation has been given for good, shape (N,)."""
         return np.array([station.handed_over for station in self.stations])
 
     def elapsed(self) -> float:
-        """Run time, s: counted from `begin`, together with what had passed before."""
         return self._clock.now() - self._zero
 
     def begin(self, histories: Mapping[str, H] | None = None, elapsed_s: float = 0.0) -> None:
@@ -155,11 +152,9 @@ class Stations(Generic[S, H]):
                 return self._measurement(fresh)
             self._wait(min([deadline, *(station.sampling.next_look for station in self.stations)]) - now)
 
-    def _between(self) -> None:
-        """Do what is due between two reactors."""
+    def _between(self) -> None: ...
 
     def _wait(self, longest_s: float) -> None:
-        """Wait a little, not longer than `longest_s`."""
         raise NotImplementedError
 
     def _measurement(self, fresh: Mask) -> Measurement:
@@ -217,11 +212,9 @@ class Stations(Generic[S, H]):
         return self._each(rows, lambda station: station.pumps_off())
 
     def give_up(self, rows: Mask) -> list[str]:
-        """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed."""
         return self._each(rows, lambda station: station.give_up())
 
     def heat_off(self, rows: Mask) -> list[str]:
-        """Heating of `rows` off for the rest of the run; returns what failed."""
         return self._each(rows, lambda station: station.heat_off())
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
@@ -237,11 +230,9 @@ class Stations(Generic[S, H]):
         return self._lines(self._all(chosen, action))
 
     def _lines(self, failed: Mapping[S, ReactorError]) -> list[str]:
-        """List what failed, in the order of the reactors."""
         return [f"{station.name}: {failed[station]}" for station in self.stations if station in failed]
 
     def _all(self, stations: Sequence[S], action: Callable[[S], Any]) -> dict[S, ReactorError]:
-        """Carry `action` out at each station; what failed."""
         failed: dict[S, ReactorError] = {}
         for station in stations:
             try:

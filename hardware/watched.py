@@ -23,11 +23,9 @@ class WatchedSafety(SafetyConfig):
 
     @classmethod
     def of(cls, safety: SafetyConfig) -> "WatchedSafety":
-        """Take the limits of another config."""
         return cls(**{f.name: getattr(safety, f.name) for f in fields(safety)})
 
     def response(self, fault: Fault | type[Fault]) -> Response:
-        """See `SafetyConfig.response`; at most no dose for this sample."""
         return min(super().response(fault), Response.HOLD)
 
 
@@ -41,7 +39,6 @@ class WatchedInterlock(Interlock):
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
     ) -> Ruling:
-        """See `Interlock.check`."""
         ruling = super().check(measurement, rate, setpoint, temperature_target, now)
         self.budget.grant(-ruling.rate)
         reasons = list(ruling.reasons)
@@ -61,12 +58,10 @@ class Watched(ABC):
         self._seen: list[tuple[float, Receipt]] = []
 
     @abstractmethod
-    def measure(self) -> Measurement:
-        """See `Reactor.measure`."""
+    def measure(self) -> Measurement: ...
 
     @abstractmethod
-    def elapsed(self) -> float:
-        """See `Reactor.elapsed`."""
+    def elapsed(self) -> float: ...
 
     def seen(self, at_s: float, volume_ml: Array) -> None:
         """Tell of doses that were seen, mL, (N,), at a run time, s."""
@@ -74,23 +69,19 @@ class Watched(ABC):
             self._seen.append((at_s, Receipt(volume_ml)))
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Return the doses that were seen since this was last called."""
         seen, self._seen = self._seen, []
         return seen
 
     def actuate(self, command: Command) -> Receipt:
-        """Give nothing."""
         return Receipt(np.zeros(len(self.names)))
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """Switch nothing."""
         return []
 
     give_up = heat_off = pumps_off
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand nothing over."""
         return []
 
     def stop(self) -> None:  # noqa: B027 (there is nothing to stop)
-        """Leave everything as it is."""
+        ...

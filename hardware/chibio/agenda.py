@@ -45,7 +45,6 @@ class Agenda:
         return self._queue[0][0] if self._queue else float("inf")
 
     def clear(self) -> None:
-        """Forget all tasks."""
         for _, _, task in self._queue:
             task.close()
         self._queue.clear()

@@ -70,7 +70,6 @@ class ChiBioConfig:
 
     @property
     def permitted(self) -> Permitted:
-        """What a client of this config may send."""
         return Permitted(self.reactors, self.overflow_pump.pump, self.fluorescence.command, self.supply.pumps)
 
 

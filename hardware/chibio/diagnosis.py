@@ -17,7 +17,6 @@ def regulates(state: DeviceState, setpoint: float) -> bool:
 
 
 def describe(state: DeviceState) -> str:
-    """Describe what the on-board regulation does."""
     return f"on-board OD regulation is {'on' if state.regulating else 'off'}, target {state.regulation_target:g}"
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from hardware.logbook import Logbook
 from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
-__all__ = ["Context", "DoseSequence"]
+__all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
@@ -36,30 +36,14 @@ def _change(before: float, now: float) -> Message | None:
     return None if same else messages.TargetChanged(before=before, now=now)
 
 
-@dataclass(frozen=True)
-class Context:
-    """One reactor's surroundings.
-
-    connection: its verified conversation. volume_ml: of its culture. calibration: of its pumps and its zero. config,
-    agenda: shared by all reactors; what must happen later is put on the agenda. book: what it reports. past: gives what
-    this run knows of the reactor by the rows that it wrote, those of earlier lives too.
-    """
-
-    connection: Connection
-    volume_ml: float
-    calibration: ReactorCalibration
-    config: ChiBioConfig
-    agenda: Agenda
-    book: Logbook
-    past: Callable[[], ReactorHistory]
-
-
 class DoseSequence:
     """The doses of one reactor, one at a time, at most one per sample.
 
     A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
+    Args: agenda: shared by all reactors; what must happen later is put on it. past: gives what this run knows of the
+      reactor by the rows that it wrote, those of earlier lives too.
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
       what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
@@ -67,10 +51,12 @@ class DoseSequence:
       dose was last seen or told.
     """
 
-    def __init__(self, context: Context) -> None:
-        self._connection, self._calibration, self._config = context.connection, context.calibration, context.config
-        self._agenda, self._book, self._past = context.agenda, context.book, context.past
-        self._clock = context.connection.clock
+    def __init__(
+        self, connection: Connection, calibration: ReactorCalibration, config: ChiBioConfig, agenda: Agenda,
+        book: Logbook, past: Callable[[], ReactorHistory],
+    ) -> None:  # fmt: skip
+        self._connection, self._calibration, self._config = connection, calibration, config
+        self._agenda, self._book, self._past, self._clock = agenda, book, past, connection.clock
         self.running = False
         self.stuck = ""
         self.escalated = False
@@ -145,7 +131,6 @@ class DoseSequence:
         return replace(plan_dose(rate, 0.0, self._past().doses, own, self._config.dosing), pump=pump)
 
     def _calibrated(self, pump: str) -> PumpCalibration:
-        """Flow of the pump that feeds."""
         return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> Message | None:
@@ -340,7 +325,6 @@ class DoseSequence:
                 self._book.tell(messages.ChangedInDose(pump=pump, cause=change or messages.RanAgain()))
 
     def _conclude(self, known: ReactorHistory) -> None:
-        """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
         pump = self._calibrated(known.feed_pump)
         ending, note = conclude(known, self._book.elapsed(), pump, self._calibration.waste)
         if note:

@@ -56,7 +56,6 @@ class PumpCalibration:
 
     @property
     def min_dose_ml(self) -> float:
-        """Smallest dose worth giving, mL."""
         return self.volume(self.min_on_s)
 
     @classmethod
@@ -80,7 +79,6 @@ class ReactorCalibration:
 
     @property
     def calibrated(self) -> bool:
-        """Whether both pumps were weighed."""
         return bool(self.feed.date and self.waste.date)
 
 
@@ -118,7 +116,6 @@ class SupplyConfig:
             require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
 
     def calibration(self, pump: str) -> PumpCalibration:
-        """Of a spare pump, as declared."""
         return PumpCalibration(flow_ml_s=self.flow_ml_s(pump), bias_s=self.bias_s)
 
     def flow_ml_s(self, pump: str) -> float:
@@ -131,7 +128,6 @@ class SupplyConfig:
 
     @property
     def pumps(self) -> tuple[str, ...]:
-        """Those that have a tube."""
         return tuple(pump for pump in SPARE if self.flow_ml_s(pump) > 0.0)
 
 
@@ -149,12 +145,10 @@ class DosePlan(Plan):
 
     @property
     def feed_s(self) -> float:
-        """Feed on-time, s."""
         return PERIOD_S * self.feed_duty
 
     @property
     def waste_s(self) -> float:
-        """Waste on-time, s."""
         return PERIOD_S * self.waste_duty
 
 

@@ -64,7 +64,6 @@ class _Pump:
 
 
 def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
-    """Feed and waste of an open dose."""
     fed_s = known.on_s if known.fed else math.inf
     wasted_s = known.on_s if math.isnan(known.waste_on[0]) else known.waste_on[0]
     feed, waste = (
@@ -160,7 +159,6 @@ def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) ->
 
 
 def _words(ending: Ending, known: ReactorHistory) -> Message | None:
-    """Say what is not as planned."""
     ml, low_ml, most_ml = known.feed_ml, ending.feed_low_ml, ending.feed_ml + ending.repeated_ml
     if (times := ending.feed_times) and math.isnan(known.feed_anew[0]):
         return DoseRepeated(ml=ml, times=times, low_ml=low_ml, most_ml=most_ml)

@@ -40,7 +40,6 @@ class FluorescenceSlotConfig:
 
     @property
     def command(self) -> str:
-        """The one POST that toggles the slot; "" if nothing is to be measured."""
         settings = (self.slot, self.led, self.base_band, self.band, "OFF", self.gain)
         return f"/SetFPMeasurement/{'/'.join(settings)}" if self.measure else ""
 

@@ -41,7 +41,6 @@ class OverflowPumpConfig:
         return tuple(p for p in PUMPS if p != self.pump)
 
     def others_on(self, state: DeviceState) -> str:
-        """Names of the other pumps that are on."""
         return ", ".join(p for p in state.running_pumps if p in self.others)
 
     @property

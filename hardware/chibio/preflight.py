@@ -121,7 +121,6 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration],
 
 
 def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig) -> Check:
-    """Whether the slot measures light, if it is on already; a run switches it on."""
     what = f"{name} fluorescence"
     slot, found = config.own(state), config.wrong(state)
     if slot is None:
@@ -139,7 +138,6 @@ def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig)
 
 
 def _reactor(name: str, state: DeviceState, calibration: ReactorCalibration, config: ChiBioConfig) -> Iterator[Check]:
-    """Check one reactor's state."""
     blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
     source = "stored" if math.isfinite(calibration.blank) else "of the device"
     yield Check(

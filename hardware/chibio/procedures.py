@@ -66,7 +66,6 @@ def warm_up(
 
 
 def _sound(reactors: ChiBioReactors) -> Measurement:
-    """Return the newest samples of reactors without a fault. Raises: DeviceStateError naming the faults."""
     m = reactors.measure()
     assert m.vitals is not None
     faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]

@@ -117,12 +117,10 @@ class DeviceState:
 
     @property
     def running_pumps(self) -> tuple[str, ...]:
-        """Names of the pumps that are on."""
         return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
 
     @property
     def pumping_modes(self) -> tuple[str, ...]:
-        """Modes that are on and switch pumps on their own."""
         return tuple(m for m in self.modes if m in PUMPING_MODES)
 
     @property

@@ -17,7 +17,7 @@ from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.dose_sequence import REFUSALS, Context
+from hardware.chibio.dose_sequence import REFUSALS
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay
@@ -63,7 +63,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         book = Logbook(name, self.note_down, self.write, self.elapsed)
         past = partial(self._past.__getitem__, name)
         volume_ml = self._bench.volume_of(name)
-        return ChibioStation(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
+        return ChibioStation(connection, volume_ml, calibration, self.config, self._agenda, book, past)
 
     def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
         """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
@@ -132,7 +132,6 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
                 self.note_down("task_failed", {"error": str(error)})
 
     def _wait(self, longest_s: float) -> None:
-        """Until the next look or the next task."""
         self._clock.sleep(max(min(longest_s, self._agenda.next_due() - self._clock.now()), 0.01))
 
     def stop(self) -> None:
@@ -182,7 +181,6 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         super().note_down(kind, self._remember(kind, fields))
 
     def _remember(self, kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Remember what a row says, as a resumed run would; return the row."""
         row = {"time_s": round(self.elapsed(), 3), **fields}
         if (name := str(row.get("reactor"))) in self._past:
             self._past[name] = self._past[name].after({"kind": kind, **row})

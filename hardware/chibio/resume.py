@@ -54,7 +54,6 @@ class ReactorHistory(History):
     KEYS: ClassVar = {**History.KEYS, "device_id": str, "blank": float, "start_time": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """Return what is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
         kind, known = row["kind"], super().after(row)
         if kind == "intent":
             feed_s, waste_s = (PERIOD_S * float(row[f"{part}_duty"]) for part in ("feed", "waste"))
@@ -91,7 +90,6 @@ class ReactorHistory(History):
 
 
 def _span(said: Any) -> Span:
-    """Two run times; None: not known."""
     return NEVER if said is None else (float(said[0]), float(said[1]))
 
 

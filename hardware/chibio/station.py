@@ -9,15 +9,19 @@ from typing import Any
 
 from conf.messages import Message
 from hardware.chibio import messages
-from hardware.chibio.agenda import Task
+from hardware.chibio.agenda import Agenda, Task
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import describe, diagnose, fault_of, regulates
-from hardware.chibio.dose_sequence import Context, DoseSequence
-from hardware.chibio.dosing import DosePlan
+from hardware.chibio.dose_sequence import DoseSequence
+from hardware.chibio.dosing import DosePlan, ReactorCalibration
 from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, PUMPS, DeviceState
+from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.logbook import Logbook
 from hardware.stations import Station
 
 __all__ = ["ChibioStation"]
@@ -32,17 +36,19 @@ AGAIN_S = 60.0  # from a restart that failed to the next one
 class ChibioStation(Station):
     """One reactor under control.
 
+    Args: volume_ml: of its culture; else as of `DoseSequence`.
     Attributes: sampling, doses, overflow_pump, fluorescence: its parts; busy, while the reactor is being started or
       recovered; restored, whether it goes on from what an earlier life left.
     """
 
-    def __init__(self, context: Context) -> None:
-        self.connection, self.book = connection, book = context.connection, context.book
-        self.name = connection.name
-        self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
-        self._volume_ml, self._past, self._clock = context.volume_ml, context.past, connection.clock
-        self.sampling = Sampling(self._config, self._clock)
-        self.doses = DoseSequence(context)
+    def __init__(
+        self, connection: Connection, volume_ml: float, calibration: ReactorCalibration, config: ChiBioConfig,
+        agenda: Agenda, book: Logbook, past: Callable[[], ReactorHistory],
+    ) -> None:  # fmt: skip
+        self.connection, self.book, self.name, self._clock = connection, book, connection.name, connection.clock
+        self._volume_ml, self._calibration, self._config, self._agenda = volume_ml, calibration, config, agenda
+        self._past, self.sampling = past, Sampling(config, connection.clock)
+        self.doses = DoseSequence(connection, calibration, config, agenda, book, past)
         self.overflow_pump = OverflowPump(connection, self._config.overflow_pump, book)
         self.fluorescence = Fluorescence(connection, self._config.fluorescence, book)
         self.busy = self.restored = False
@@ -218,11 +224,9 @@ class ChibioStation(Station):
         return False if self.busy else self._judge(state)
 
     def _keep_on(self, state: DeviceState) -> DeviceState:
-        """Overflow pump and fluorescence slot as this run has them; the reactor's state then."""
         return self.fluorescence.keep_on(self.overflow_pump.keep_on(state))
 
     def _judge(self, state: DeviceState) -> bool:
-        """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
         self.doses.watch(state, ours=not self.handed_over)
         self._unspoil(state)
@@ -265,7 +269,6 @@ class ChibioStation(Station):
         return (self.doses.stuck or "its pumps could not be verified off") if self.doses.escalated else self._ended
 
     def _take(self, state: DeviceState, now: float) -> None:
-        """Deliver a new sample, write it down, and put heater and stirrer right."""
         sampling, self._restarts = self.sampling, 0
         if note := sampling.take(state, now):
             self.book.tell(note)
@@ -355,7 +358,6 @@ class ChibioStation(Station):
         self.regulated_od = setpoint
 
     def _hand_over_again(self) -> None:
-        """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
         state, done = self.connection.read(), "left to it"
         if not regulates(state, self.regulated_od):
             self.regulate(self.regulated_od)
@@ -363,7 +365,6 @@ class ChibioStation(Station):
         self.book.tell(messages.StaysHandedOver(setpoint=self.regulated_od, done=done))
 
     def _take_control(self) -> None:
-        """Switch the on-board regulation off, which was found on. Raises: ReactorError."""
         self.connection.switch("OD", False)
         if not self.handed_over:
             self.book.tell(messages.RegulationFoundOn())

@@ -40,8 +40,6 @@ def plant_preset(name: str) -> PlantConfig:
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the emulated device is built."""
-
     unit: int = setting(0, "number of the device; different devices have different identities", at_least=0)
     vial: VialConfig = part(VialConfig, "optics and electronics")
     plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
@@ -53,7 +51,6 @@ class DeviceOptions:
 
 
 def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
-    """One value per reactor. Raises: ValueError for another number of them."""
     values = [float(given)] * n if isinstance(given, (int, float)) else [float(x) for x in given]
     if len(values) != n:
         raise ValueError(f"{what} has {len(values)} values: allowed 1 or {n}, one per reactor")
@@ -109,7 +106,6 @@ class ChiBioDevice:
         return self.supervisor.worker.software.apps
 
     def next_time(self) -> float:
-        """When the next event is due, device s; inf if none."""
         return self._events.next_time()
 
     def run_until(self, t: float) -> None:
@@ -141,7 +137,6 @@ class ChiBioDevice:
             self.faults.bus_stuck, self.faults.bus_stuck_when_pumping = True, False
 
     def _time_out(self) -> Steps:
-        """End a request that outlives the worker's time-out."""
         self.supervisor.kill_worker()
         yield from ()
 

@@ -21,8 +21,6 @@ FEED_CAP = 0.02  # the on-board regulator's own limit
 
 
 class Experiment:
-    """The experiment of one reactor."""
-
     def __init__(self, position: Position, outputs: Outputs, optics: Optics) -> None:
         self._position, self._outputs, self._optics = position, outputs, optics
         self._started: float | None = None
@@ -55,7 +53,6 @@ class Experiment:
             yield from self._outputs.set_on(item, 0)
 
     def _finish(self) -> Steps:
-        """End of the last cycle."""
         yield from self._outputs.everything_off()
         self._position.terminal("Experiment Stopped")
 
@@ -122,7 +119,6 @@ class Experiment:
         yield from self._outputs.set_on("Stir", 1)
 
     def _store(self, started: float) -> Steps:
-        """Store records, thin them, write files."""
         data, experiment = self._position.data, self._position.data["Experiment"]
         if experiment["cycles"] % 10 == 9:
             clear_terminal(data, self._position.computer.stamp())

@@ -27,7 +27,6 @@ class Position:
 
     @property
     def answers(self) -> bool:
-        """Tell whether a reactor is connected to the cable."""
         return self.vial is not None and not self.vial.faults.unplugged
 
     def forget(self, selected: str) -> None:
@@ -36,11 +35,9 @@ class Position:
         self.terminal("System Initialised")
 
     def terminal(self, text: str) -> None:
-        """One line in the web page's log."""
         add_terminal(self.data, self.computer.stamp(), text)
 
     def spawn(self, steps: Steps, what: str) -> None:
-        """Start the reactor's thread `what`."""
         self.computer.spawn(steps, f"{self.name}/{what}")
 
     def hardware(self) -> Vial:
@@ -73,8 +70,6 @@ def store_target(output: SysData, value: float) -> None:
 
 
 class Outputs:
-    """The outputs of one reactor."""
-
     def __init__(self, position: Position) -> None:
         self._position = position
         self.forget()

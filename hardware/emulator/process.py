@@ -42,7 +42,6 @@ class EmulatorProcess(AbstractContextManager["EmulatorProcess"]):
         self.url, self.control = ready[1], ready[2]
 
     def close(self) -> None:
-        """End it. Idempotent."""
         self._process.terminate()
         try:
             self._process.wait(5.0)

@@ -66,7 +66,6 @@ class EmulatorServer:
         self._stop.set()
 
     def run(self) -> None:
-        """Serve; returns after `stop`."""
         control = threading.Thread(target=self._control.serve_forever, args=(POLL_S,), daemon=True)
         control.start()
         try:
@@ -92,7 +91,6 @@ class EmulatorServer:
             self._stop.wait(POLL_S)
 
     def advance(self) -> None:
-        """Run what is due on the device."""
         with self.lock:
             self.device.run_until(self.device.clock.now())
 
@@ -216,7 +214,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of the program."""
     program = "python -m hardware.emulator"
     usage = f"{program} [--reactors M0,M1] [--speed 60] ...; {program} --help says all"
     p = argparse.ArgumentParser(prog=program, usage=usage, description="Emulated Chi.Bio behind HTTP.")
@@ -253,7 +250,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _numbers(what: str, given: str) -> float | list[float]:
-    """One number, or one per reactor. Raises: ValueError."""
     try:
         numbers = [float(x) for x in given.split(",")]
     except ValueError:

@@ -54,7 +54,6 @@ class Software:
         return self.apps[self.selected if name == "0" else name]
 
     def select(self, name: str) -> None:
-        """Select a reactor for everybody."""
         self.selected = name
         for app in self.apps.values():
             app.data["UIDevice"] = name

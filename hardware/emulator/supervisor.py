@@ -30,7 +30,6 @@ class WebWorker:
         self._serving: Exchange | None = None
 
     def boot(self, software: Software) -> None:
-        """Serve again, with other software."""
         self.software, self.ready = software, True
         self._serve_next()
 
@@ -41,12 +40,10 @@ class WebWorker:
             self._serving.fate, self._serving = "reset", None
 
     def turn_away(self) -> None:
-        """Nobody will serve those that wait."""
         while self._waiting:
             self._waiting.popleft().fate = "reset"
 
     def accept(self, exchange: Exchange) -> None:
-        """Accept a request that has arrived."""
         self._waiting.append(exchange)
         self._serve_next()
 

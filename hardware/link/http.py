@@ -152,17 +152,14 @@ class HttpTransport(Transport):
         )
 
     def disarm(self) -> None:
-        """BYE to the agent, if there is one; its switch then rests until the next request."""
         if self._token:
             with contextlib.suppress(ReactorError):
                 self.post("/_agent/bye")
 
     def switched_off(self) -> SwitchedOff:
-        """Ask the agent, if there is one, what it has switched off. Raises: LinkError, ProtocolError."""
         return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 
     def close(self) -> None:
-        """Close the client. Idempotent."""
         self._client.close()
 
     def _request(self, method: str, path: str) -> Reply:

@@ -47,7 +47,6 @@ class DeviceLock:
             kept.write_text(str(self.session))
 
     def close(self) -> None:
-        """Free it. Idempotent."""
         self._held.close()
 
 

@@ -68,8 +68,7 @@ class Transport(Protocol):
         """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
         return self._request("POST", path)
 
-    def _request(self, method: str, path: str) -> Reply:
-        """One request over this link, GET or POST. Raises: as `get` and `post`."""
+    def _request(self, method: str, path: str) -> Reply: ...
 
     def disarm(self) -> None:
         """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.

@@ -94,7 +94,6 @@ class PioreactorConfig:
         return replace(self, **{key: getattr(own, key) for key in keys})
 
     def address(self, unit: str) -> str:
-        """Of a unit's web server."""
         return (self.units.get(unit, UnitConfig()).address or f"http://{unit}.local").rstrip("/")
 
     def password(self) -> str:

@@ -40,7 +40,6 @@ class UnitHistory(History):
     KEYS: ClassVar = {**History.KEYS, "boot": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
         known = super().after(row)
         if row["kind"] == "intent":
             return replace(known, pump=int(feeds_by(row)[-1]), id=str(row["id"]), task="")
@@ -127,7 +126,6 @@ class Doses:
         return messages.DosedElsewhere() if self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS) else None
 
     def work(self) -> None:
-        """Do what is due; called again and again."""
         if self._course is None:
             self._settle_pins()
             if job := next((job for job in self.pumps.jobs if self.pumps.odd(job)), ""):
@@ -155,7 +153,6 @@ class Doses:
     # -- the course of a dose --------------------------------------------------------------------------------------
 
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
-        """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
         most_ml = max(plan.waste_ml, plan.feed_ml + LATE_ML)  # of a job that ended late: its waste takes that, too
@@ -185,7 +182,6 @@ class Doses:
         self._conclude(plan, dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
-        """Conclude a dose: record its end, then correct what was booked since it began."""
         for job, moved, ml in ((self._job, media, media.high), (WASTE, waste, waste.low)):
             self.pumps.counted[job, dose] = ml
             if moved.end:

@@ -71,7 +71,6 @@ class Unit:
 
     @property
     def real(self) -> Clock:
-        """Real time: messages, jobs, pins."""
         return self.clock.real
 
     def say(self, topic: str, payload: str) -> None:
@@ -138,11 +137,9 @@ class Pumps:
         return (pin.on and settled and not self.box.live(job, *AUTOMATIONS)) or (state.word == "lost" and new)
 
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:
-        """Whether the unit was started again, by its list of running jobs."""
         return boot_of(rows) not in ("", self.boot)
 
     def named(self, job: str) -> str:
-        """Name a pump, and the pin behind it."""
         return f"the {NAMES[job]} pump (pin {self.box.jobs[job]})"
 
     def told_on(self, job: str) -> bool:
@@ -156,7 +153,6 @@ class Pumps:
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
 
     def said(self, request: Request) -> float:
-        """Sum what the events of a run reported so far, mL."""
         return self.reported[request.job, request.dose]
 
     def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
@@ -195,7 +191,6 @@ class Pumps:
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
-        """Follow a job to its end; return what it gave."""
         job = request.job
         if why := (yield from self._begins(request)):
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
@@ -227,7 +222,6 @@ class Pumps:
         return (now - on_s) * flow if self.box.heard_s > end_s else 0.0
 
     def broke(self, request: Request) -> bool:
-        """Whether the connection to the broker was lost since a run was asked for."""
         return self.mqtt.broke_s >= request.asked_s
 
     def _begins(self, request: Request) -> Steps[Message | None]:
@@ -341,7 +335,6 @@ PROOFS: tuple[dict[str, tuple[Any, ...]], ...] = (
 
 
 def is_off(seen: Seen) -> bool:
-    """Whether that proves a pump off."""
     return any(all(getattr(seen, key) in values for key, values in row.items()) for row in PROOFS)
 
 
@@ -364,7 +357,6 @@ class ForcedEnd:
         self._rebooted = self.lost = self._held = False
 
     def _shorts(self) -> float:
-        """Sum what short runs of the pump reported, mL."""
         return self._p.reported[self._job, self._p.short]
 
     def act(self) -> None:
@@ -389,7 +381,6 @@ class ForcedEnd:
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
     def _look(self) -> Seen:
-        """Return what is known now."""
         p, pin, state = self._p, self._p.pins[self._job], self._p.box.state(self._job)
         self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)

@@ -30,7 +30,6 @@ class UnitSampling(Newest):
         self.spread, self.read_s, self.number, self.count = math.nan, now, 0, 0
 
     def take(self, readings: list[Reading]) -> None:
-        """Take readings that arrived, at clock times."""
         self._readings.extend(readings)
         self.read_s = readings[-1].at if readings else self.read_s
 

@@ -111,7 +111,6 @@ class PioreactorStation(Station):
             self.lie_down(error, history)
 
     def _start(self, job: str) -> Iterator[float]:
-        """Ask for one of the vendor's jobs. Raises: ReactorError."""
         options, overrides = request(job, self._config, self._pumps.facts, self._target, self.regulated_od)
         yield from self._answer(self._web.run, job, options, overrides)
         self._asked_s[job] = self._real.now()
@@ -173,7 +172,6 @@ class PioreactorStation(Station):
         return is_new
 
     def _wrong(self) -> Fault | None:
-        """Return what is wrong now."""
         if not self._mqtt.connected:
             return messages.NoBroker(broker=self._config.broker, why=self._mqtt.lost or "nothing comes")
         if found := self._pumps.trouble or self._mqtt.holder(self.name):
@@ -203,7 +201,6 @@ class PioreactorStation(Station):
         return messages.DoseNotTaken(why=self.doses.refused[-1]) if self.doses.refused[1:] else None
 
     def _wanted(self) -> list[str]:
-        """List the jobs that this run keeps going."""
         heated = self._config.thermostat and not self.heat_is_off and math.isfinite(self._target)
         wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: self.handed_over}
         return [job for job, it_is in wanted.items() if it_is]
@@ -254,7 +251,6 @@ class PioreactorStation(Station):
         return plan
 
     def set_temperature(self, target: float) -> None:
-        """Thermostat to a target, degC; nan leaves it."""
         if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
             return
         self._target, self._target_sent_s, self._target_sends = target, -math.inf, 0

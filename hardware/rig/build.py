@@ -31,7 +31,6 @@ def _runs(python: str) -> bool:
 
 
 def broker() -> str | None:
-    """Find the MQTT broker, None if there is none."""
     return shutil.which("mosquitto") or shutil.which("/usr/sbin/mosquitto")
 
 
@@ -48,7 +47,6 @@ def home(package: str = PUBLISHED, folder: str = "") -> Path:
 
 
 def version(env: Path) -> str:
-    """Of the vendor's package in a built environment."""
     return next(env.glob("lib/python*/site-packages/pioreactor-*.dist-info")).stem.split("-")[1]
 
 

@@ -75,7 +75,6 @@ def flows(k: int) -> dict[str, float]:
 
 
 def model(volume_ml: float) -> str:
-    """Return the vendor's name of a unit with a vial for this culture."""
     return f"pioreactor_{vial_ml(volume_ml)}ml"
 
 

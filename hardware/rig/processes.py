@@ -125,7 +125,6 @@ class Rig:
         }  # fmt: skip
 
     def kill(self, name: str) -> None:
-        """Kill one process by kill -9."""
         self.processes[name].kill()
         self.processes[name].wait()
 

@@ -74,7 +74,6 @@ class _Vial:
 
     @property
     def seen_od(self) -> float:
-        """What the photodiode sees."""
         true = float(self.plant.apparent_od[0]) if math.isnan(self.held_od) else self.held_od
         return true + self.offset_od
 
@@ -190,13 +189,11 @@ class VialServer:
         return {"volts": VOLTS_PER_OD * vial.seen_od}
 
     def power_cut(self, unit: str) -> None:
-        """Every pin of a unit falls to 0."""
         with self._lock:
             for pin in self.vials[unit].duty:
                 self.vials[unit].drive(pin, 0.0, 0, time.time())
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
         self._ended.set()
         self._thread.join(2.0)
         self._wire.close()

@@ -66,7 +66,6 @@ class FeedBudget:
         return allowed, findings
 
     def _room(self, now: float) -> dict[type[Fault], Array]:
-        """Return the mL that may still be fed, by what limits them, shape (N,) each."""
         c = self._config
         self._roll(now)
         recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)

@@ -52,7 +52,6 @@ class Ruling:
 
     @property
     def kinds(self) -> tuple[tuple[str, ...], ...]:
-        """Per reactor the kinds of its faults."""
         return tuple(tuple(fault.kind for fault in faults) for faults in self.faults)
 
 
@@ -152,7 +151,6 @@ class Interlock:
         return np.asarray(allowed)
 
     def _reported(self, m: Measurement) -> list[list[Fault]]:
-        """Collect the faults that the reactors report themselves."""
         faults = m.vitals.faults if m.vitals is not None else (None,) * self.n
         return [[fault] if fault is not None else [] for fault in faults]
 
@@ -168,7 +166,6 @@ class Interlock:
                 self._hold_kind = np.where(finding.cool, float(pause), self._hold_kind)
 
     def _add_holds(self, found: list[list[Fault]], fresh: Mask, now: float) -> None:
-        """Add a pause, where its fault was found a while ago and is not found again now."""
         for i in np.flatnonzero(fresh & (now < self._hold_until_s)):
             pause = PAUSES[int(self._hold_kind[i])]
             if pause.kind not in [fault.kind for fault in found[i]]:

@@ -34,7 +34,6 @@ class Finding:
     cool: Mask | None = None
 
     def of(self, n: int) -> Fault:
-        """Say it of reactor n."""
         return self.fault(**{k: float(v[n]) if isinstance(v, np.ndarray) else v for k, v in self.seen.items()})
 
 

@@ -158,5 +158,4 @@ class UnexplainedChange:
         self._excess[row] = self._over[row, 0] = self._since_low_ml[row] = 0.0
 
     def dosed(self, feed_ml: Array, low_ml: Array) -> None:
-        """Book what was dosed, at most and at least, mL, shape (N,)."""
         self._since_ml, self._since_low_ml = self._since_ml + feed_ml, self._since_low_ml + low_ml

@@ -34,7 +34,6 @@ class Given:
     pump: int = 0
 
     def row(self, why: str) -> dict[str, Any]:
-        """As the journal keeps what was given beside the doses that were commanded."""
         volumes = {"feed_ml": self.feed_ml, "feed_low_ml": self.low_ml, "waste_ml": self.waste_ml}
         return {"at_s": self.at_s, "why": why, **volumes, **({"pump": self.pump} if self.pump else {})}
 
@@ -93,7 +92,6 @@ class Ending:
         return first + again
 
     def row(self) -> dict[str, Any]:
-        """As the journal keeps it."""
         known = {key: value for key, value in asdict(self).items() if value == value and (key != "pump" or value)}
         return {"verified_off": True, "repeated_ml": self.repeated_ml, **known}
 
@@ -165,7 +163,6 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
 
 
 def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
-    """Run time, s, and volumes of feed and waste, mL, of a row."""
     return float(row[when]), float(row["feed_ml"]), float(row["waste_ml"])
 
 

@@ -174,7 +174,6 @@ class Journal:
         return list(_parse(newest, self.path))
 
     def close(self) -> None:
-        """Release the file. Idempotent."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -192,7 +191,6 @@ def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _check(rows: list[dict[str, Any]], path: Path) -> None:
-    """Whether every row has what all rows have. Raises: RecordingError."""
     kinds: dict[str, Any] = {"n": int, "wall": (int, float), "kind": str}
     for row in rows:
         wrong = [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]

@@ -38,7 +38,6 @@ class Mark:
 
     @property
     def measured(self) -> bool:
-        """Whether the run takes something over."""
         return (self.level_ml, self.share, self.bottle_ml) != (None, None, None)
 
 
@@ -56,7 +55,6 @@ def add_mark(folder: Path, mark: Mark) -> Path:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Nobody else adds a mark to this folder meanwhile."""
     held = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)

@@ -77,7 +77,6 @@ class Recorder(AbstractContextManager["Recorder"]):
         return not (self.path.exists() and os.path.samestat(self.path.stat(), os.fstat(self._fd)))
 
     def close(self) -> None:
-        """Close the file. Idempotent."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

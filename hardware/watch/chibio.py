@@ -40,11 +40,9 @@ class WatchedChiBio(Watched):
         self._newest = np.full(5, math.nan)  # at, OD, temperature, raw, blank
 
     def elapsed(self) -> float:
-        """See `Reactor.elapsed`."""
         return self._clock.now() - self._began_s
 
     def measure(self) -> Measurement:
-        """Look until there is a new sample, or for a while. Raises: nothing; trouble is in `vitals`."""
         self._clock.sleep(max(self._arrived_s + CYCLE_S - self._clock.now(), 0.0))
         until_s, fault, fresh = self._clock.now() + AGAIN_S, None, False
         while not fresh and self._clock.now() < until_s:
@@ -58,7 +56,6 @@ class WatchedChiBio(Watched):
         return Measurement(at, od, warm, np.full(1, fresh), Vitals(age, raw, (fault,), blank))
 
     def _look(self) -> tuple[bool, Fault | None]:
-        """Whether a new sample came, and what is wrong. Raises: ReactorError."""
         reply = self._get("/getSysdata/")
         if reply.status != 200:
             raise WrongStatus(request="GET /getSysdata/", status=reply.status, expected=200)
