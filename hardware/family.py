@@ -178,11 +178,7 @@ class Family:
         """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
 
     def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
-        """Whether spare pumps can give doses, and these are large enough.
-
-        Args: pumps: numbers of those that each reactor is fed by. who: asks for that, a key.
-        Raises: UnfitError.
-        """
+        """Whether spare pumps (numbers, per reactor) can give large doses to `who`, a key. Raises: UnfitError."""
         if not any(pumps):
             return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
@@ -207,10 +203,7 @@ class Family:
         return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
     def holding(self, backend: Any, preset: str, **values: Any) -> Any:
-        """Put a preset of vials into a config that simulates vials of its own, where none was chosen.
-
-        Args: values: further ones of the config.
-        """
+        """Put a preset of vials, and values, into a config that simulates vials of its own, where none was chosen."""
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
@@ -229,10 +222,7 @@ class Family:
         return math.inf
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s.
-
-        Args: reactors: as opened.
-        """
+        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s."""
         return None, 1.0
 
     def address(self, backend: Any) -> str:

@@ -128,8 +128,6 @@ class Stations(Generic[S, H]):
         """Every reactor as an earlier life left it, then into its running state. Raises: as `begin`."""
         raise NotImplementedError
 
-    # ------------------------------------------------------------------------------------------------- measurement
-
     def measure(self) -> Measurement:
         """Return the newest samples; wait for one, doing what is due meanwhile.
 
@@ -172,8 +170,6 @@ class Stations(Generic[S, H]):
         vitals = Vitals(self._clock.now() - column("arrived_s"), column("raw"), faults, column_or_none("blank"))
         time_s, light = column("at") - self._zero, column_or_none("fluorescence")
         return Measurement(time_s, column("od"), column("temperature"), fresh, vitals, light)
-
-    # --------------------------------------------------------------------------------------------------- actuation
 
     def actuate(self, command: Command) -> Receipt:
         """Begin one dose per row of `command.rows`, targets first; its end is carried out by `measure`.
@@ -218,10 +214,7 @@ class Stations(Generic[S, H]):
         return self._each(rows, lambda station: station.heat_off())
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand `rows` over to the device's own regulation at `setpoint` (OD, shape (N,)); returns what failed.
-
-        The reactor then feeds itself; commands for it are refused from here on.
-        """
+        """Hand `rows` over to the device's own regulation at `setpoint`, OD, (N,), for good; returns what failed."""
         targets = dict(zip(self.names, setpoint, strict=True))
         return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
 
@@ -254,8 +247,6 @@ class Stations(Generic[S, H]):
     def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
         """All pumps of these off for good; what could not be verified."""
         raise NotImplementedError
-
-    # ----------------------------------------------------------------------------------------------------- journal
 
     def raise_late(self) -> None:
         """Raise what the log raised where it must not stand in the way of a pump-off; once."""

@@ -18,10 +18,7 @@ PARTS = ("feed", "waste", "blank")
 
 
 def save_calibration(folder: Path, reactor: str, part: str, values: Mapping[str, Any]) -> Path:
-    """Write FOLDER/REACTOR_PART.yaml, whole or not at all; returns its path.
-
-    Args: part: feed, waste or blank. Raises: UnfitError if the folder cannot be written.
-    """
+    """Write FOLDER/REACTOR_PART.yaml (feed, waste, blank), whole or not at all; return its path. Raises: UnfitError."""
     path = folder / f"{reactor}_{part}.yaml"
     try:
         folder.mkdir(parents=True, exist_ok=True)

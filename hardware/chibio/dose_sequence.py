@@ -263,11 +263,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """As pumps are found says what became of a dose, so they are looked at before they are switched off.
-
-        They are switched off without that where nothing was missed. That is not so after an answer was missing, and
-        where an earlier life of the program left the dose open.
-        """
+        """Look at pumps before switching them off, after a missing answer or where an earlier life left the dose open."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:
@@ -300,10 +296,7 @@ class DoseSequence:
             self._quiet_s = now
 
     def _look(self, state: DeviceState, seen_s: float) -> None:
-        """Write down what a look at the device says of the pumps of an open dose.
-
-        Args: seen_s: run time of the last answer before it, nan if none was missing.
-        """
+        """Write down what a look says of an open dose. Args: seen_s: of the last answer, nan if none was missing."""
         known, now, stopped = self._past(), self._book.elapsed(), None
         if not known.open:
             return

@@ -130,10 +130,7 @@ def found(
 def conclude(
     known: ReactorHistory, now_s: float, feed: PumpCalibration, waste: PumpCalibration
 ) -> tuple[Ending, Message | None]:
-    """How the open dose in `known` ended, and what is not as planned, None if nothing is.
-
-    Args: now_s: run time at which its pumps were verified off. feed, waste: the two pumps.
-    """
+    """How the open dose in `known`, verified off at run time now_s, ended, and what is not as planned, or None."""
     fed, wasted = _pumps(known)
     least_s, most_s, anew_s = fed.on_s(now_s)
     low_ml, low_times, low_last_ml = _runs(least_s, fed.dose_s, PERIOD_S + MOTOR_S, feed)

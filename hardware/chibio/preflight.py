@@ -96,10 +96,7 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
 
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration], room_ml: float) -> Check:
-    """Check what the overflow pump covers; without one, what cannot be prevented.
-
-    Args: room_ml: above the fullest culture.
-    """
+    """Check what the overflow pump covers; room_ml is above the fullest culture."""
     overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
     if not overflow.pump:
         return Check(

@@ -66,10 +66,7 @@ class Sampling(Newest):
         self._looked = not is_new
 
     def take(self, state: DeviceState, now: float) -> Message | None:
-        """Make a new sample the newest one; returns what it shows of the board's clock, None if nothing.
-
-        Args: now: clock time at which it was seen.
-        """
+        """Make a new sample, seen at `now`, the newest one; return what it shows of the board's clock, or None."""
         self.key = (state.sample_s, state.cycles)
         self.arrived_s = self.at = now
         self.od, self.temperature = state.sample_od, state.sample_temperature

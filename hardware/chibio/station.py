@@ -59,8 +59,6 @@ class ChibioStation(Station):
         self._heat = True
         self._blank = math.nan
 
-    # ------------------------------------------------------------------------------------------- start and recovery
-
     def restore(self) -> None:
         """Take over identity and memory of an earlier life; all pumps but the overflow pump are verified off then.
 
@@ -84,10 +82,7 @@ class ChibioStation(Station):
         self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
-        """Task: an experiment that runs with the right blank and targets; a running one is adopted, not restarted.
-
-        Args: waited: an old cycle thread is known to have ended. Raises (from its steps): ReactorError.
-        """
+        """Task: have the experiment run as it should; adopt one that runs. Args: waited: no old cycle is left."""
         try:
             yield from self._let_measure()
             state = self.connection.read()
@@ -179,10 +174,7 @@ class ChibioStation(Station):
             raise messages.DoesNotStart(reactor=self.name)
 
     def _recover(self, kind: str) -> Task:
-        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead.
-
-        What does not succeed is said, and tried again when the fault is seen the next time.
-        """
+        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead; else said."""
         self._restarts += 1
         if self._restarts > 1:
             self.book.tell(messages.RestartedAgain(attempt=self._restarts))
@@ -203,8 +195,6 @@ class ChibioStation(Station):
         finally:
             self.busy = False
             self.sampling.arrived_s = self._clock.now()  # a further recovery waits its time
-
-    # ------------------------------------------------------------------------------------------------- measurement
 
     def poll(self) -> bool:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
@@ -311,13 +301,8 @@ class ChibioStation(Station):
         except ReactorError as error:
             self.book.tell(messages.NotPutRight(item=item, found=found, done=done, error=error))
 
-    # --------------------------------------------------------------------------------------------------- actuation
-
     def dose(self, rate: float, number: int) -> DosePlan:
-        """Begin the dose for the newest sample (`DoseSequence.begin`), unless the reactor may not be dosed now.
-
-        Args: rate: mL/s. number: of the pump that feeds.
-        """
+        """Begin the dose, mL/s by pump `number`, for the newest sample, unless the reactor may not be dosed now."""
         refusal: Message | None = self.book.fault
         pump = f"Pump{number}"
         if self.handed_over:
@@ -343,10 +328,7 @@ class ChibioStation(Station):
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError.
-
-        Written down before it is done: a run that is killed in between hands over when it is resumed.
-        """
+        """Hand over to the on-board regulation, at most 0.02 of full power; written down first. Raises: ReactorError."""
         connection = self.connection
         connection.pumps_off(pumps=self._config.overflow_pump.others)
         self.book.log("regulate", setpoint=setpoint)

@@ -103,7 +103,7 @@ class ChiBioDevice:
     @property
     def apps(self) -> dict[str, ReactorApp]:
         """What the software that runs, or ran last, holds of each position M0 to M7."""
-        return self.supervisor.worker.software.apps
+        return self.supervisor.software.apps
 
     def next_time(self) -> float:
         return self._events.next_time()
@@ -128,7 +128,7 @@ class ChiBioDevice:
         except (AppError, ArithmeticError, LookupError, TypeError, ValueError) as problem:
             computer.note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends, silently as there
             return
-        deadline = self.supervisor.worker.deadline
+        deadline = self.supervisor.deadline
         if event.owner == REQUEST and events.now + pause > deadline:
             events.add(deadline - events.now, self._time_out(), event.life, event.owner)
         elif pause < math.inf:
@@ -156,7 +156,7 @@ class ChiBioDevice:
 
     def _arrive(self, exchange: Exchange) -> Steps:
         if self.supervisor.alive:
-            self.supervisor.worker.accept(exchange)
+            self.supervisor.accept(exchange)
         else:
             exchange.fate = "refused"
         yield from ()

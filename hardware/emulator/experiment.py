@@ -157,10 +157,7 @@ class Experiment:
 
 
 def _feed_duty(data: SysData) -> float:
-    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up.
-
-    `data` is sysData with at least two records and a volume; OD.Integral and OD.Integral2 are updated.
-    """
+    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up."""
     od, times = data["OD"], data["time"]["record"]
     now, before = od["current"], od["record"][-1]
     target = od["target"] if od["target"] > 0 else 1e-6

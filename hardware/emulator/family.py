@@ -44,10 +44,7 @@ class EmulatorFamily(ChiBioFamily):
 
     @contextmanager
     def linked(self, backend: ChiBioConfig, bench: Bench) -> Iterator[Link]:
-        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock.
-
-        Raises: ReactorError.
-        """
+        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock."""
         assert isinstance(backend, EmulatorConfig)
         if not backend.speed:
             log.info("emulated device inside this program, in virtual time")

@@ -93,10 +93,7 @@ class Outputs:
         yield from self._apply(item)
 
     def _apply(self, item: str) -> Steps:
-        """`SetOutput`: make the electronics do what `ON` and `target` say.
-
-        Raises: AppError for an item that drives nothing; its flag is set by then.
-        """
+        """`SetOutput`: the electronics do what `ON` and `target` say. Raises: AppError for what drives nothing."""
         output, now = self._position.data[item], self._position.computer.now()
         if item == "Stir":
             yield from self._stir()

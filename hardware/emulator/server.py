@@ -119,7 +119,7 @@ class EmulatorServer:
                 if method == "GET" and parts == ["truth"]:
                     s = device.supervisor
                     software = {"alive": s.alive, "restarts": s.restarts, "exits": s.exits}
-                    seen = {"selected": s.worker.software.selected, "errors": list(device.computer.errors)}
+                    seen = {"selected": s.software.selected, "errors": list(device.computer.errors)}
                     return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
                 kept = method == "GET" and parts[0] in ("doses", "samples", "reads")
                 if kept and parts[1:] in [[m] for m in device.vials]:

@@ -71,10 +71,7 @@ class Transport(Protocol):
     def _request(self, method: str, path: str) -> Reply: ...
 
     def disarm(self) -> None:
-        """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.
-
-        The next request arms it again. Raises: nothing; an armed switch is the safe side.
-        """
+        """Tell a dead-man switch that all pumps are verified off; the next request arms it again. Raises: nothing."""
         return
 
     def switched_off(self) -> SwitchedOff:
@@ -134,10 +131,7 @@ class SharedLink(Transport):
 
 
 def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff:
-    """Read from the status of a board agent what it has switched off.
-
-    Args: clock: of the device. Raises: ProtocolError for a status that is not an agent's.
-    """
+    """Read from an agent's status what it has switched off, by the device's clock. Raises: ProtocolError."""
     try:
         found = json.loads(status)["switched_off"]
         return {m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()}
@@ -175,10 +169,7 @@ class TransportConfig:
 
 
 def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r"[!-~]") -> str:
-    """One line of `least` to 256 characters, for the config value `key`.
-
-    Raises: LinkError naming the file and the remedy; never the secret.
-    """
+    """One line of `least` to 256 characters, for the config value `key`. Raises: LinkError, never with the secret."""
     file = Path(path).expanduser()
     try:
         mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()

@@ -150,8 +150,6 @@ class Doses:
         if self._course is None:
             self._settle_strange()
 
-    # -- the course of a dose --------------------------------------------------------------------------------------
-
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
@@ -242,8 +240,6 @@ class Doses:
             more_ml, self._taken_ml = before_ml + taken_ml - self._taken_ml, before_ml + taken_ml
             high_ml, low_ml = self._now_ml[:2] - self._base_ml
             self._fed(high_ml, low_ml, more_ml)
-
-    # -- what nobody commanded -------------------------------------------------------------------------------------
 
     def _silence(self, job: str, name: str) -> Iterator[float]:
         """End a pump that runs without a job, or whose job was killed, and record what it moved."""

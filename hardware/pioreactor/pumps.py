@@ -208,10 +208,7 @@ class Pumps:
         return self._moved(request)
 
     def _beyond(self, request: Request) -> float:
-        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard.
-
-        A unit that lost its power says nothing; one that has it is asked.
-        """
+        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard."""
         pin, flow, now = self.pins[request.job], self.flow_ml_s[request.job], self.clock.now()
         on_s = max(pin.on_s, request.asked_s)
         end_s = on_s + request.ml / flow

@@ -53,8 +53,6 @@ class PioreactorStation(Station):
         self._listed = set[str]()
         self._target_sent_s, self._target_sends = math.inf, 0
 
-    # -- bringing up -----------------------------------------------------------------------------------------------
-
     def bring_up(self, history: UnitHistory) -> Iterator[float]:
         """Version and calibrations read, jobs adopted or started, an open dose looked for. Raises: ReactorError."""
         self.regulated_od = history.handed_over
@@ -115,8 +113,6 @@ class PioreactorStation(Station):
         yield from self._answer(self._web.run, job, options, overrides)
         self._asked_s[job] = self._real.now()
         self.book.log("command", job=job, options=options)
-
-    # -- what happens ----------------------------------------------------------------------------------------------
 
     def go_on(self) -> None:
         """Take in what the unit said, and go on with a dose and what else is under way."""
@@ -230,8 +226,6 @@ class PioreactorStation(Station):
         """Start a job anew; one that is there and does nothing is first ended."""
         with suppress(ReactorError):
             yield from self._answer(self._web.stop, job) if self._box.live(job) else self._start(job)
-
-    # -- commands --------------------------------------------------------------------------------------------------
 
     def dose(self, rate: float, pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""

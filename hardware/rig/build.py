@@ -72,10 +72,7 @@ def newer() -> str:
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:
-    """Build the environment with the vendor's package, if it is not there. Args: as of `home`.
-
-    Raises: DeviceStateError with what is missing, or pip's last line.
-    """
+    """Build the environment of a package if it is not there. Raises: DeviceStateError with what is missing."""
     if lack := missing(package, folder):
         raise DeviceStateError(f"the rig cannot be built: {lack}")
     env = home(package, folder)

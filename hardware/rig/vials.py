@@ -41,10 +41,7 @@ class Pulse:
 
 
 def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float], growth_x: float) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml`, pulse dosing, in the vendor's vial. Raises: ValueError for an unknown name.
-
-    Args: volume_ml: up to the waste tube. flow: of its pumps, mL/s.
-    """
+    """Preset `conf/plant/NAME.yaml` in the vendor's vial, with the flows of its pumps, mL/s. Raises: ValueError."""
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=float(vial_ml(volume_ml)))
     pump = replace(plant.pump, dosing="pulse", gain_ml_s=flow["media_pump"], waste_ml_s=flow["waste_pump"])

@@ -134,10 +134,7 @@ class SafetyConfig:
         return self.composition_low, self.composition_high
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
-        """Ages of a newest sample that is stale and that is lost, s.
-
-        Raises: ValueError for an age that is over before the next sample comes.
-        """
+        """Ages at which a newest sample is stale and lost, s. Raises: ValueError for less than a control period."""
         stale_s = bench.stale_s if self.stale_s is None else self.stale_s
         lost_s = max(3.0 * bench.period_s, stale_s) if self.lost_s is None else self.lost_s
         require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")

@@ -127,17 +127,11 @@ class Interlock:
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
 
     def fluorescence(self, measurement: Measurement) -> Array | None:
-        """Fresh counts that may be believed, nan for all others, shape (N,); None where none are measured.
-
-        Asked before `check`, as `believes`; changes nothing.
-        """
+        """Fresh counts that may be believed, else nan, shape (N,), or None; asked before `check`, changes nothing."""
         return self._light.believed(measurement)
 
     def command(self, actuator: Actuator, asked: Array) -> Array:
-        """Cut what a signal asks of an actuator to its limits, in its unit, shape (N,); nan stays.
-
-        The next `check` tells of what was cut.
-        """
+        """Cut what a signal asks of an actuator to its limits, (N,); nan stays. The next `check` tells of it."""
         low, high = actuator.low, actuator.high
         if actuator.pump:
             low, high = 0.0, self.bench.max_rate
@@ -216,10 +210,7 @@ class Interlock:
         return {key: value for part in (*self._parts, self) for key, value in memory.save(part).items()}
 
     def restore(self, state: Any) -> None:
-        """Restore the output of `state` into an interlock that has not been used.
-
-        Raises: ValueError if it is of another number of reactors or another version, or damaged.
-        """
+        """Restore the output of `state` into an unused interlock. Raises: ValueError for what does not fit."""
         if isinstance(state, dict) and (other := set(state) ^ set(self.state())):
             raise ValueError(f"interlock: its saved state has other fields: {', '.join(sorted(other))[:80]}")
         for part in (*self._parts, self):

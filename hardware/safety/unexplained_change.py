@@ -45,10 +45,7 @@ class UnexplainedChange:
         self._eased = np.zeros(n)  # samples in a row that speak against it
 
     def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
-        """Judge the readings of the `believed` rows.
-
-        Args: reading, setpoint: OD, shape (N,). time_s: when it was taken, s, shape (N,).
-        """
+        """Judge the readings of the `believed` rows: OD and setpoint, when they were taken, s, all of shape (N,)."""
         od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
         step, down, suspects, settled = self._steps(od, t)
         self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)

@@ -61,10 +61,7 @@ class History:
 
     @classmethod
     def replay(cls, rows: Sequence[Mapping[str, Any]]) -> dict[str, Self]:
-        """Replay the journal of a run for each reactor.
-
-        Args: rows: that a driver has written, oldest first. Raises: RecordingError for a row that is not so.
-        """
+        """Replay the rows of a journal, oldest first, for each reactor. Raises: RecordingError for a damaged row."""
         known: dict[str, Self] = {}
         seen_s = 0.0
         for row in rows:

@@ -200,10 +200,7 @@ def _check(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """All whole rows, oldest first, and how many bytes of a torn last line follow them; the file stays untouched.
-
-    Raises: RecordingError if the file is missing or damaged elsewhere than at its end.
-    """
+    """All whole rows, oldest first, and how many bytes of a torn last line follow them. Raises: RecordingError."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -42,10 +42,7 @@ class Mark:
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
-    """Append a mark to a run folder, on the disk when this returns; the running program takes over what was measured.
-
-    Raises: RecordingError if the disk refuses or the file is another one.
-    """
+    """Append a mark to a run folder, on the disk when this returns; the run takes it over. Raises: RecordingError."""
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with _alone(folder), Recorder(folder / NAME, COLUMNS) as file:
         cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, *(getattr(mark, key) for key in MEASURED))

@@ -76,10 +76,7 @@ class WatchedChiBio(Watched):
         return True, None
 
     def _fed_ml(self, data: dict[str, Any], state: DeviceState) -> float:
-        """Volume that the feed pump was told to give from the last sample to this one, by the device's own records.
-
-        A record's duty acts until the next one.
-        """
+        """Volume that the feed pump was told to give since the last sample: a record's duty acts until the next one."""
         times, duties = (data[key].get("record", []) for key in ("time", FEED))
         n = min(len(times), len(duties))
         time, duty = np.array(times[len(times) - n :], dtype=float), np.array(duties[len(duties) - n :], dtype=float)
