@@ -166,14 +166,11 @@ class Connection:
         self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
 
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """Switch these pumps off, verified. Each is tried even if another one fails, unless nothing answers at all.
+        """Switch these pumps off, verified; the waste pump last, as it runs where a feed pump may.
 
-        The waste pump goes off last, after every feed pump was heard to: where one may run, it runs too.
-
-        Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
-        So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
-        server's worker, whose end switches everything off: the remote kill switch (docs/device.md, Failures).
-
+        Each is tried even if another one fails, unless nothing answers. Read-back alone proves nothing, for the flags
+        are intent: with the bus hung they say off while the motor runs. So a blocking call touches the bus in between.
+        On a hung bus it outlasts the server's worker, whose end switches everything off (docs/device.md, Failures).
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """
         for attempt in range(tries):

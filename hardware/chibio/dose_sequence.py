@@ -97,16 +97,11 @@ class DoseSequence:
         refusal: Message | None,
         pump: str = FEED,
     ) -> DosePlan:
-        """Begin the dose for `sample`; returns what was, or may have been, begun.
+        """Begin the dose for `sample`; return what was, or may have been, begun. A note says why nothing was.
 
-        Nothing is begun, and a note says why, if that sample was acted on already, is too old for a dose to end
-        before the next measurement, or the reactor may not be dosed at all.
-
-        Args:
-          rate: mean feed rate, mL/s.
-          sample: its key, None if there is none; appeared_s: clock time at which it appeared, -inf if unknown.
-          refusal: why the reactor may not be dosed, None if it may.
-          pump: that gives it: the feed pump, or a supply pump, whose doses are carried nowhere.
+        Args: rate: mean, mL/s. sample: its key, None if there is none. appeared_s: clock time at which it appeared,
+          -inf if unknown. refusal: why the reactor may not be dosed, None if it may. pump: that gives it; only the feed
+          carries.
         Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
         """
         plan = self._plan(rate, pump)
@@ -235,10 +230,9 @@ class DoseSequence:
             yield self._pause_s()
 
     def settle(self, tries: int = 1, overflow_pump: bool = False) -> None:
-        """All pumps off, verified; a dose under way is over then, and so on record.
+        """All pumps off, verified; a dose under way is over then, and so on record. Raises: as `Connection.pumps_off`.
 
         After an answer that was missing the device is looked at first: what it shows says what became of the dose.
-        Args: overflow_pump: that one too. Raises: as `Connection.pumps_off`.
         """
         connection = self._connection
         try:
@@ -263,7 +257,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """Look at pumps before switching them off, after a missing answer or where an earlier life left the dose open."""
+        """Look at pumps before they go off, after a missing answer or where an earlier life left the dose open."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:

@@ -83,14 +83,12 @@ def found(
     """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
 
     None takes back what was answered and is not so; then it may be on anew, or the look may be an old answer delivered
-    again, so what was answered stays the least. So it is where another target is found than was set. Nothing is added
-    where the answers have told it. Of a pump that is found off `OFF` says when it went off.
+    again, so what was answered stays the least. So it is where another target is found than was set. Of a pump that is
+    found off `OFF` says when it went off.
 
-    Args:
-      state: as read at run time now_s. seen_s: run time of the last answer before that.
-      silence_s: of this program, after which a board agent, if there is one, switches pumps off.
-      stopped: pump, run time at which an agent says that it found it on and switched it off; None: it does not say.
-      killed: an earlier life of the program left the dose open, and what it sent last is not on record.
+    Args: state: as read at run time now_s. seen_s: run time of the last answer before that. silence_s: of this program,
+      after which a board agent, if there is one, switches pumps off. stopped: pump, run time at which an agent switched
+      it off; None: it does not say. killed: an earlier life left the dose open, what it sent last is not on record.
     """
     added: dict[str, Span | None] = {}
     restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)

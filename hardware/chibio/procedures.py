@@ -75,13 +75,11 @@ def _sound(reactors: ChiBioReactors) -> Measurement:
 
 
 def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array]:
-    """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
+    """Average the raw counts of `samples` cycles of clear medium, set them as blanks; return mean and sd, shape (N,).
 
-    Returns their mean and standard deviation, shape (N,).
-
-    Needs clear medium in stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own
-    measurement, stirrer still, so they hold under run conditions (docs/device.md, Blank).
-    Raises: SensorError if a count is impossible or they scatter by more than 2 %; ReactorError.
+    Needs stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own measurement, so
+    they hold under run conditions (docs/device.md, Blank).
+    Raises: SensorError for counts that cannot be or scatter by more than 2 %; ReactorError.
     """
     rows: list[list[float]] = [[] for _ in reactors.names]
     while min(map(len, rows)) < samples:

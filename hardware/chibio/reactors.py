@@ -52,18 +52,18 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
     ) -> None:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         super().__init__(clock, config.stale_s, log)
-        self.config, self._bench = config, bench or Bench()
+        self.config, bench = config, bench or Bench()
         self._link = SharedLink(transport, clock)
         self._past = dict.fromkeys(config.reactors, ReactorHistory())
         self._agenda = Agenda(clock)
-        self.stations = tuple(self._station(*one) for one in zip(config.reactors, calibrations, strict=True))
-
-    def _station(self, name: str, calibration: ReactorCalibration) -> ChibioStation:
-        connection = Connection(name, self.config.permitted, self._link, self._clock, self.note_down)
-        book = Logbook(name, self.note_down, self.write, self.elapsed)
-        past = partial(self._past.__getitem__, name)
-        volume_ml = self._bench.volume_of(name)
-        return ChibioStation(connection, volume_ml, calibration, self.config, self._agenda, book, past)
+        self.stations = tuple(
+            ChibioStation(
+                Connection(name, config.permitted, self._link, clock, self.note_down), bench.volume_of(name),
+                calibration, config, self._agenda, Logbook(name, self.note_down, self.write, self.elapsed),
+                partial(self._past.__getitem__, name),
+            )
+            for name, calibration in zip(config.reactors, calibrations, strict=True)
+        )  # fmt: skip
 
     def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
         """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
@@ -87,9 +87,8 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
     def _take_over(self, histories: Mapping[str, ReactorHistory]) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
 
-        An overflow pump is verified on before the first dose. An experiment that already runs is adopted, never started
-        again (a second start would stop it); its next new sample is the first one delivered. So is a reactor that was
-        handed over to the on-board regulation: it stays so.
+        An experiment that already runs is adopted, never started again (a second start would stop it), and a reactor
+        that was handed over to the on-board regulation stays so.
         """
         self._past |= histories
         failed = list[ReactorError]()

@@ -19,9 +19,8 @@ FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 class Sampling(Newest):
     """The newest sample of one reactor.
 
-    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. A
-    sample that was waited for appeared when it was seen. The smallest offset between the two clocks among such samples
-    shows how late any other one was seen.
+    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. The
+    smallest offset between the two clocks among samples that were waited for shows how late any other one was seen.
 
     Attributes: key, (record time, cycles) of the newest sample, None before the first; late_s, how long after it
       appeared it was seen.

@@ -328,7 +328,7 @@ class ChibioStation(Station):
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation, at most 0.02 of full power; written down first. Raises: ReactorError."""
+        """Hand over to the on-board regulation, at most 0.02 of full power; first written down. Raises: as `post`."""
         connection = self.connection
         connection.pumps_off(pumps=self._config.overflow_pump.others)
         self.book.log("regulate", setpoint=setpoint)

@@ -99,10 +99,6 @@ class Computer:
         """Format the board's clock as in the web page."""
         return datetime.fromtimestamp(self.wall(), UTC).strftime("%Y-%m-%d %H:%M:%S")
 
-    def uniform(self, low: float, high: float) -> float:
-        """Draw a random number from the computer's own stream."""
-        return float(self.rng.uniform(low, high))
-
     def bus(self, name: str) -> None:
         if self.faults.bus_stuck:
             raise BusStuck(name)

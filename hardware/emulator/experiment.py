@@ -83,7 +83,7 @@ class Experiment:
         rest = experiment["cycleTime"] - round(computer.wall() - began, 2)
         if rest < 0.0:
             self._position.terminal("Experiment Cycle Time is too short!!!")
-        yield max(rest, 0.0) + CYCLE_EXTRA_S + computer.uniform(0.0, 0.04)
+        yield max(rest, 0.0) + CYCLE_EXTRA_S + computer.rng.uniform(0.0, 0.04)
         yield from self._outputs.set_on(data["Light"]["Excite"], 0)
         self._position.terminal(f"Cycle {experiment['cycles']} Complete")
         if experiment["ON"] and experiment["threadCount"] == mine:

@@ -12,22 +12,10 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from conf.schema import require
 from hardware.clock import DeviceClock
 from hardware.errors import ReactorError
-from hardware.link import messages
-from hardware.link.transport import (
-    MAX_BODY,
-    WEB_ADDRESS,
-    Reply,
-    SwitchedOff,
-    Transport,
-    TransportConfig,
-    new_session,
-    read_secret,
-    switched_off,
-    web_address,
-)  # fmt: skip
+from hardware.link import messages, transport
+from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session
 
 __all__ = ["HttpTransport", "fetch"]
 
@@ -137,11 +125,11 @@ class HttpTransport(Transport):
         self, url: str, speed: float = 1.0, config: TransportConfig | None = None, session: int | None = None
     ) -> None:
         config = config or TransportConfig()
-        require(web_address(url), "url", repr(url), WEB_ADDRESS)
+        transport.require_web_address("url", url)
         self.url = url.rstrip("/")
         self._clock = DeviceClock(speed)
         self._read_s = config.timeout(config.read_s, self._clock)
-        self._token = read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
+        self._token = transport.read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
             timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, self._clock)),
@@ -157,7 +145,7 @@ class HttpTransport(Transport):
                 self.post("/_agent/bye")
 
     def switched_off(self) -> SwitchedOff:
-        return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
+        return transport.switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 
     def close(self) -> None:
         self._client.close()

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-from conf.schema import check, setting
+from conf.schema import check, require, setting
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError
 from hardware.link import messages
 
 __all__ = [
-    "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
-    "read_secret", "switched_off", "web_address",
+    "MAX_BODY", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
+    "read_secret", "require_web_address", "switched_off",
 ]  # fmt: skip
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
@@ -30,17 +30,14 @@ MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
 
 
-WEB_ADDRESS = "http://host:port, for instance http://192.168.7.2:5000"
-
-
-def web_address(url: str) -> bool:
-    """Whether a server can be reached under it: `WEB_ADDRESS`, with https too, without a path."""
+def require_web_address(key: str, url: str) -> None:
+    """Raise ValueError, naming the config's key, for what is no http or https address of a host without a path."""
     try:
         parts = urlsplit(url)
-        _ = parts.port
+        _, good = parts.port, parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
     except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
+        good = False
+    require(good, key, repr(url), "http://host:port, for instance http://192.168.7.2:5000")
 
 
 def new_session() -> int:

@@ -139,9 +139,6 @@ class Pumps:
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:
         return boot_of(rows) not in ("", self.boot)
 
-    def named(self, job: str) -> str:
-        return f"the {NAMES[job]} pump (pin {self.box.jobs[job]})"
-
     def told_on(self, job: str) -> bool:
         """Whether the unit tells that a pump is on, since the broker is there, and not because of a short run."""
         pin, broke_s, before_s = self.pins[job], self.mqtt.broke_s, self.clock.now() - SETTLE_S

@@ -13,7 +13,7 @@ from hardware.errors import ReactorError
 from hardware.messages import Fault, UndosedFault
 from hardware.pioreactor import messages
 from hardware.pioreactor.doses import Doses, UnitHistory
-from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
+from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, NAMES, PUMPS, WASTE
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts, regulates, request, target_of
@@ -274,10 +274,10 @@ class PioreactorStation(Station):
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
                     heard = box.heard_s > self._real.now() - PUMPS_S
-                    on = [pumps.named(job) for job in PUMPS if heard and pumps.told_on(job)]
+                    on = [job for job in PUMPS if heard and pumps.told_on(job)]
                     why = (pumps.trouble or "look at the unit's log") if self._mqtt.connected else "no broker to ask"
                     if on:
-                        raise messages.UnitPumpOn(unit=self.name, pump=on[0], why=why)
+                        raise messages.UnitPumpOn(unit=self.name, pump=NAMES[on[0]], pin=box.jobs[on[0]], why=why)
                     off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
                     raise messages.UnitPumpsUnproven(unit=self.name, why=why, off=off)
                 self.go_on()
