@@ -41,10 +41,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
-    """Pumps and blanks of `reactors`; what was never measured is nominal, and its blank is nan (the device's own).
-
-    Raises: UnfitError naming the file and what is wrong with it.
-    """
+    """Pumps and blanks of reactors; what was never measured is nominal, and its blank nan. Raises: UnfitError."""
     calibrations = []
     for name in reactors:
         feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)

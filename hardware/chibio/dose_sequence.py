@@ -230,9 +230,10 @@ class DoseSequence:
             yield self._pause_s()
 
     def settle(self, tries: int = 1, overflow_pump: bool = False) -> None:
-        """All pumps off, verified; a dose under way is over then, and so on record. Raises: as `Connection.pumps_off`.
+        """All pumps off, verified, the overflow pump too if asked; a dose under way is on record then.
 
         After an answer that was missing the device is looked at first: what it shows says what became of the dose.
+        Raises: as `Connection.pumps_off`.
         """
         connection = self._connection
         try:

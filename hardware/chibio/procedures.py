@@ -18,9 +18,8 @@ LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus
 
 
 def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
-    """Give `doses` single-shot doses of 63 s * `duty`, one per step; yields how many have been given.
+    """Give `doses` single doses of 63 s * `duty`, one per step, verified off after each; yield how many.
 
-    The pump is verified off after every dose and when the generator is closed.
     Raises: DeviceStateError if an experiment runs or a dose did not begin; LinkError, ProtocolError.
     """
     state = connection.read()

@@ -60,9 +60,8 @@ class ChibioStation(Station):
         self._blank = math.nan
 
     def restore(self) -> None:
-        """Take over identity and memory of an earlier life; all pumps but the overflow pump are verified off then.
+        """Take over from an earlier life; pumps are verified off, unless the reactor regulates itself as left.
 
-        A reactor that regulates itself as it was handed over is not interrupted.
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
         history = self._past()
