@@ -38,11 +38,9 @@ class RealClock:
 
 
 class DeviceClock:
-    """Device time, for samples, doses and the run: `speed` device seconds pass in one real second.
+    """Device time, for samples, doses and the run: `speed` device seconds pass in one real second, 1 on the bench.
 
-    No other module converts between the two.
-
-    Args: speed: 1 on the bench. real: clock that it runs on; None: the machine's.
+    No other module converts between the two. Args: real: clock that it runs on; None: the machine's.
     Raises: ValueError if speed is not positive.
     """
 

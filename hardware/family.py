@@ -114,13 +114,10 @@ class Opening:
 class Family:
     """One kind of reactor. What a kind of one's own must give is `config` and `open`; the rest has defaults.
 
-    Attributes:
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`. It needs `kind`, the name of the
-        family, and `reactors`, their names.
-      can: what its reactors can do.
-      called: its reactors, for a reader.
-      at_stake: a culture is: a policy that is doubtful or not certified is refused.
-      simulated: its vials are of `plant`, in this process and in virtual time, and the program knows their truth.
+    Attributes: config, dataclass of its values, whose fields are made by `conf.schema.setting`; it needs `kind`, the
+      name of the family, and `reactors`, their names. can: what its reactors can do. called: its reactors, for a
+      reader. at_stake: a culture is: a policy that is doubtful or not certified is refused. simulated: its vials are of
+      `plant`, in this process and in virtual time, and the program knows their truth.
     """
 
     config: type[Any]
@@ -140,10 +137,8 @@ class Family:
     def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
         """Check what a run needs, a line for each thing; opens and closes what that takes. Raises: ReactorError.
 
-        A family that does not say how is opened as for a run; each reactor is sampled once, and its pumps are verified
-        off.
-
-        Args: folder: where the run will write.
+        A family that does not say how is opened as for a run, which writes into `folder`; each reactor is sampled once,
+        and its pumps are verified off.
         """
         checks: list[Check] = []
         with tempfile.TemporaryDirectory() as name, closing(Journal(Path(name) / "journal.jsonl", fsync=False)) as rows:

@@ -21,11 +21,8 @@ def no_log(kind: str, fields: Mapping[str, Any]) -> None: ...
 class Logbook:
     """One reactor's journal, notes and fault.
 
-    Args:
-      name: of the reactor, the `reactor` of every row.
-      log: takes a row; must never raise (see `hardware.stations`).
-      write: takes a row that must be on the disk before what it speaks of is done, e.g. an intent; may raise.
-      elapsed: run time, s.
+    Args: log: takes a row; must never raise (see `hardware.stations`). write: takes a row that must be on the disk
+      before what it speaks of is done, e.g. an intent; may raise. elapsed: run time, s.
     Attributes: fault; news, whether its kind changed since someone last looked; notes for the next receipt.
     """
 

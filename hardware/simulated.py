@@ -16,10 +16,7 @@ __all__ = ["FAMILY", "SimulatedConfig", "SimulatedFamily", "SimulatedReactors"]
 
 @dataclass(frozen=True)
 class SimulatedConfig:
-    """`backend=sim`: simulated vials in this process, in virtual time.
-
-    Raises: ValueError naming key, value and allowed range.
-    """
+    """`backend=sim`: simulated vials in this process, in virtual time. Raises: ValueError naming key and range."""
 
     kind: str = setting("sim", "backend")
     reactors: tuple[str, ...] = setting(("M0",), "names of the simulated vials", some=True)
@@ -32,12 +29,10 @@ class SimulatedConfig:
         require(unique, "backend.reactors", self.reactors, "one or more unique names")
 
 
-class SimulatedReactors:
+class SimulatedReactors(Reactor):
     """`Reactor` in front of a plant: a cycle is sample, decide, dose, grow for the rest of the control period.
 
-    Args:
-      plant: N vials, reset to the state the run starts from.
-      config: names and what the pump is believed to deliver. control_min: between samples, min.
+    Args: plant: N vials, reset to the state the run starts from. control_min: between samples, min.
     """
 
     def __init__(self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0) -> None:
@@ -75,9 +70,6 @@ class SimulatedReactors:
         self._target = np.where(asked, command.temperature, self._target)
         return Receipt(volume_ml=volume)
 
-    def repeated(self) -> list[tuple[float, Receipt]]:
-        return []
-
     def elapsed(self) -> float:
         return 60.0 * self._minutes
 
@@ -85,13 +77,6 @@ class SimulatedReactors:
         """No dose is pending for `rows` any more. Nothing can fail."""
         self._feed_s = np.where(rows, 0.0, self._feed_s)
         return []
-
-    @property
-    def handed_over(self) -> Mask:
-        return np.zeros(self.plant.n, dtype=np.bool_)
-
-    def give_up(self, rows: Mask) -> list[str]:
-        return self.pumps_off(rows)
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Switch the heater of `rows` off until a temperature is commanded. Nothing can fail."""

@@ -235,10 +235,7 @@ class Stations(Generic[S, H]):
         return failed
 
     def stop(self) -> None:
-        """All pumps off, verified, but those of a reactor that was handed over; the rest goes on. Idempotent.
-
-        Raises: PumpsNotOff naming every reactor whose pumps could not be verified off, and what to do.
-        """
+        """All pumps off, verified, but those of a reactor that was handed over. Idempotent. Raises: PumpsNotOff."""
         failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
         self.note_down("stop", {"reactors": self.names, "not_verified": failed})
         if failed:

@@ -1,6 +1,5 @@
 """Reactors that are read and cannot act, and the interlock over them, which only tells."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hardware.messages import Fault
-from hardware.reactor import Array, Command, Mask, Measurement, Receipt
+from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
@@ -21,10 +20,6 @@ LASTING = 3  # samples in a row: a single odd reading withholds no dose here
 class WatchedSafety(SafetyConfig):
     """Limits beside a device that the interlock cannot stop."""
 
-    @classmethod
-    def of(cls, safety: SafetyConfig) -> "WatchedSafety":
-        return cls(**{f.name: getattr(safety, f.name) for f in fields(safety)})
-
     def response(self, fault: Fault | type[Fault]) -> Response:
         return min(super().response(fault), Response.HOLD)
 
@@ -33,7 +28,7 @@ class WatchedInterlock(Interlock):
     """Tells of what lasts, and expects none of the doses that it allows. Arguments as of `Interlock`."""
 
     def __init__(self, n: int, config: SafetyConfig, *args: Any) -> None:
-        super().__init__(n, WatchedSafety.of(config), *args)
+        super().__init__(n, WatchedSafety(**{f.name: getattr(config, f.name) for f in fields(config)}), *args)
         self._stood: list[dict[str, int]] = [{} for _ in range(n)]
 
     def check(
@@ -49,19 +44,13 @@ class WatchedInterlock(Interlock):
         return replace(ruling, reasons=reasons)
 
 
-class Watched(ABC):
-    """N reactors that somebody else regulates, as a `Reactor`. What goes in is evidence, told by `repeated`."""
+class Watched(Reactor):
+    """N reactors that somebody else regulates. What goes in is evidence, told by `repeated`."""
+
+    names: tuple[str, ...] = ()
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
-        self.handed_over = np.zeros(len(self.names), dtype=np.bool_)
-        self._seen: list[tuple[float, Receipt]] = []
-
-    @abstractmethod
-    def measure(self) -> Measurement: ...
-
-    @abstractmethod
-    def elapsed(self) -> float: ...
+        self.names, self._seen = tuple(names), list[tuple[float, Receipt]]()
 
     def seen(self, at_s: float, volume_ml: Array) -> None:
         """Tell of doses that were seen, mL, (N,), at a run time, s."""
@@ -83,5 +72,5 @@ class Watched(ABC):
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
         return []
 
-    def stop(self) -> None:  # noqa: B027 (there is nothing to stop)
-        ...
+    def stop(self) -> None:
+        """Leave everything as it is."""

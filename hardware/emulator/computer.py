@@ -76,9 +76,8 @@ class EventQueue:
 
 
 class Computer:
-    """Clocks, threads and bus.
+    """Clocks, threads and bus. Args: now: device time at the start, s; unit: which of several devices.
 
-    Args: now: device time at the start, s; rng: how busy it happens to be; unit: which of several devices.
     `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
     """
 

@@ -29,10 +29,10 @@ __all__ = ["ChiBioDevice", "DeviceOptions", "plant_preset"]
 
 @functools.cache
 def plant_preset(name: str) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows.
+    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows. Raises: ValueError.
 
-    The vial's optics (`VialConfig`) stand for noise, misreadings and counts of the preset's sensor, which are left out:
-    a vial takes only the sensor's noise-free value. Raises: ValueError naming the presets.
+    `VialConfig` stands for noise, misreadings and counts of its sensor: a vial takes only the sensor's noise-free
+    value.
     """
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     return replace(plant, pump=replace(plant.pump, dosing="pulse"))
@@ -60,14 +60,10 @@ def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
 class ChiBioDevice:
     """A Chi.Bio control computer with reactors.
 
-    Args:
-      reactors: positions with a reactor plugged in, e.g. ("M0", "M1").
-      clock: device seconds; `handle` sleeps on it.
-      rng: noise of everything, one stream per reactor.
-      options: see `DeviceOptions`.
-      od: initial optical density, one for all or one per reactor; temperature: of the vials, degC.
-      volumes_ml: culture up to the waste tube, one for all or one per reactor.
-      blanked: start with the zeros an operator has set with clear medium; False = 65000, as after power-on.
+    Args: reactors: positions with a reactor plugged in. clock: device seconds; `handle` sleeps on it. rng: of all
+      noise, a stream per reactor. od: initial density; volumes_ml: culture up to the waste tube; one for all or one per
+      reactor. temperature: of the vials, degC. blanked: start with the zeros of clear medium; False = 65000, as after
+      power-on.
     Raises: ValueError for an unknown or repeated position or a wrong number of ODs.
     """
 

@@ -103,9 +103,8 @@ class Switches(SimpleNamespace):
 
 
 def inject(device: Any, name: str, reactor: str = "all", value: float = 1.0) -> None:
-    """Switch fault `name` of `FAULTS` to `value`.
+    """Switch fault `name` of `FAULTS` of a `ChiBioDevice` to `value`, at a reactor, M0 to M7, or "all".
 
-    Args: device: a `ChiBioDevice`. reactor: M0 to M7, or "all"; ignored by faults of the whole board.
     Raises: ValueError for an unknown name, a position without reactor, or a value out of range.
     """
     if name not in FAULTS:

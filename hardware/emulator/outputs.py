@@ -16,9 +16,8 @@ OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running mo
 class Position:
     """What outputs, optics and experiment of one reactor share; `data` is its sysData.
 
-    Args:
-      name: M0 to M7; computer: the board; vial: what hangs on the cable, None for an empty position;
-      device_id: what its IR thermometer answers as identity; selected: reactor shown on the web page.
+    Args: name: M0 to M7; vial: what hangs on the cable, None for an empty position; device_id: what its IR thermometer
+      answers as identity; selected: reactor shown on the web page.
     """
 
     def __init__(self, name: str, computer: Computer, vial: Vial | None, device_id: str, selected: str) -> None:

@@ -42,11 +42,7 @@ CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request
 
 
 class EmulatorServer:
-    """Serves `device` on two ports until `stop`.
-
-    Args: device: on a DeviceClock; host; port, control_port: 0 picks a free one.
-    Raises: OSError if a port cannot be had.
-    """
+    """Serves `device` on two ports until `stop`; port 0 picks a free one. Raises: OSError if one cannot be had."""
 
     def __init__(self, device: ChiBioDevice, host: str, port: int, control_port: int) -> None:
         self.device, self.lock = device, threading.Lock()
@@ -137,10 +133,7 @@ def _json(value: object) -> bytes:
 
 
 class _DevicePort(HTTPServer):
-    """The device's port.
-
-    `fates` says how connections without an answer end: "reset", or "lost" = stays open and silent (kept in `held`).
-    """
+    """The device's port; fates: how connections end unanswered, "reset", or "lost": silent, in `held`."""
 
     timeout = POLL_S
     allow_reuse_address = True

@@ -36,10 +36,7 @@ class ReactorApp(Position):
 
 
 class Software:
-    """Memory of one process, with every position as after `initialise()`.
-
-    Args: computer: it runs on; vials: by position, those that hang on a cable.
-    """
+    """Memory of one process, with every position as after `initialise()`; vials, by position, hang on a cable."""
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
         self.computer, self.selected = computer, "M0"

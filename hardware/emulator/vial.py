@@ -91,11 +91,7 @@ class VialConfig:
 
 
 class Spectrometer:
-    """One laser and the chip that counts its light.
-
-    Args: config: optics; faults: what is broken, may change at any time; rng: noise of this reactor.
-    `blank` is the count of clear medium.
-    """
+    """One laser and the chip that counts its light; `blank` is the count of clear medium. Args: rng: its noise."""
 
     def __init__(self, config: VialConfig, faults: Switches, rng: np.random.Generator) -> None:
         self._config, self._faults, self._rng = config, faults, rng
@@ -116,13 +112,10 @@ class Spectrometer:
         return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
 
     def counts(self, at: float, exposure_s: float, od: float, moving: bool) -> int:
-        """One spectrometer reading of the laser, 16-bit counts.
+        """One spectrometer reading of the laser, 16-bit counts, at device second `at`.
 
-        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
-        readings are lower.
-        Args:
-          at: device s; exposure_s: how long it should have been lit since `begin_exposure`.
-          od: what a noise-free sensor would show, OD; moving: whether the vial's content is in motion.
+        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred (moving) or
+        half-lit readings are lower: it should have been lit for exposure_s since `begin_exposure`.
         """
         f, c, rng = self._faults, self._config, self._rng
         if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
@@ -147,10 +140,8 @@ class Spectrometer:
 
 
 class Vial:
-    """One reactor as the chips see it.
+    """One reactor, a plant of one vial, as the chips see it.
 
-    Args:
-      plant: a plant of one vial; config: optics and electronics; rng: noise of this reactor; start: device s.
     `doses` holds what the motors did, `samples` what the software recorded, `reads` when a client was sent the newest
     sample (device s), all also over restarts; `on_s` the motors' total on-time, `peak_ml` the highest volume.
     """

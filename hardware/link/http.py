@@ -80,8 +80,7 @@ def fetch(
 ) -> tuple[int, bytes, httpx.Headers]:
     """Status, body and headers of an answer that came whole within `wait_s`, so that nobody who dribbles holds a loop.
 
-    Raises: LinkError, whose cause is an `httpx.ConnectError` or `ConnectTimeout` where nobody was reached;
-      ProtocolError for what is no HTTP answer, or longer than MAX_BODY.
+    Raises: LinkError, whose cause is an httpx.ConnectError or ConnectTimeout where nobody was reached; ProtocolError.
     """
     what, deadline, found = f"{method} {urlsplit(url).path}", time.monotonic() + wait_s, bytearray()
     try:
@@ -114,10 +113,7 @@ class HttpTransport(Transport):
 
     Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
     answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
-
-    Args:
-      url: http://host:port of the device; speed: device seconds per real second (1 on the bench).
-      session: 1 to 65535, by which a board agent knows this client from a second one.
+    Args: speed: device seconds per real second. session: by which a board agent knows this client from a second one.
     Raises: ValueError for a malformed address; LinkError for a token's file; LinkError, ProtocolError from the calls.
     """
 

@@ -62,12 +62,8 @@ class SerialTransport(Transport):
 
     The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
     memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
-    The state comes reduced (see `board_agent.py`).
-
-    Args:
-      port: serial device or pyserial URL; speed: device seconds per real second.
-      attempts: times one request line is sent before the link counts as lost.
-      session: 1 to 65535, by which the agent knows this client from a second one; the upper half of every ID.
+    Args: port: serial device or pyserial URL. attempts: times one request line is sent before the link counts as lost.
+      session: by which the agent knows this client from a second one; the upper half of every ID.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 

@@ -86,10 +86,7 @@ class SharedLink(Transport):
     After a request that took longer than `SILENT_S` and brought no answer, every request within the next `PAUSE_S`
     fails at once. So a silent server costs all reactors together one time-out, and they are told of it within that.
     Where others are answered between two time-outs of one reactor, requests about that one alone fail at once, for
-    `REST_S`: it must not take its neighbours' time.
-
-    Args: link: carries the requests. clock: device time.
-    Attributes: heard_s, clock time of the newest answer, -inf before the first.
+    `REST_S`: it must not take its neighbours' time. heard_s is the clock time of the newest answer.
     """
 
     SILENT_S, PAUSE_S, REST_S = 1.0, 2.0, 40.0

@@ -37,8 +37,8 @@ def broker() -> str | None:
 def home(package: str = PUBLISHED, folder: str = "") -> Path:
     """Where the environment of a package is, built or not; a wheel is known by its name and content.
 
-    Args: package: version on the package index, with or without "pioreactor==", or path of a wheel. folder: of all
-      environments, "" for the one in the user's cache.
+    Args: package: version on the package index, or path of a wheel. folder: of all environments, "" for the user's
+      cache.
     """
     wheel, key = Path(package).expanduser(), package.removeprefix("pioreactor==")
     if wheel.is_file():

@@ -124,12 +124,9 @@ class _Vial:
 
 
 class VialServer:
-    """All vials behind one UDP port, on a thread of its own.
+    """All vials behind one UDP port, on a thread of its own; truth.jsonl in a folder has every run of a pump.
 
-    Args:
-      plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
-      folder: truth.jsonl, every run of a pump and once a second every vial, is written here.
-    Attributes: port.
+    Args: plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
     """
 
     def __init__(self, plants: Mapping[str, PlantConfig], growth_x: float, folder: Path, seed: int = 0) -> None:

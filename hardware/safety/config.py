@@ -39,11 +39,7 @@ RAW_MIN, RAW_MAX = 5.0, 65534.0  # counts: a failed spectrometer reads 1, a satu
 
 @dataclass(frozen=True)
 class Responses:
-    """Responses of which a lab may choose others: report | hold | pumps_off | regulate | stop.
-
-    report: dose as allowed. hold: no dose. pumps_off: no dose and the pumps off, verified. regulate: hand over to the
-    device's own regulation for good. stop: no dose in this run any more.
-    """
+    """Responses of which a lab may choose others, by the words of `Response`; report is its PASS."""
 
     budget: str = setting(BudgetFault.response, "a feed budget is used up", choices=tuple(WORDS)[1:])
     jump: str = setting(JumpFault.response, "a step that neither growth nor a dose explains", choices=NOT_REGULATE)

@@ -90,14 +90,11 @@ class Interlock:
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
     ) -> Ruling:
-        """Judge the newest samples and the proposed feed rates.
+        """Judge the newest samples and the proposed feed rates. Raises: nothing; what is wrong is in the verdict.
 
-        Args:
-          measurement: what the reactors said; `vitals` may be None.
-          rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh sample count.
-          setpoint: OD, shape (N,). temperature_target: degC, shape (N,), nan where there is no thermostat.
-          now: monotonic time, s; never goes back.
-        Raises: nothing; what is wrong is in the verdict.
+        Args: measurement: what the reactors said. rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh
+          sample count. setpoint: OD, (N,). temperature_target: degC, (N,), nan without a thermostat. now: monotonic
+          time, s.
         """
         rate, setpoint = np.array(rate, dtype=np.float64), np.array(setpoint, dtype=np.float64)
         target_c = np.asarray(temperature_target, dtype=np.float64)
@@ -185,10 +182,7 @@ class Interlock:
         return Response.HOLD if isinstance(fault, PAUSES) else self.config.response(fault)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
-        """Book what was dosed; without a waste pump in the model the level stays at its tube.
-
-        Args: receipt: of the command that followed `check`; now: monotonic time of the dose, s.
-        """
+        """Book the receipt of a command at a time, s; without a waste pump in the model the level stays at its tube."""
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         self.budget.book(feed, waste, now)

@@ -136,10 +136,7 @@ class UnexplainedChange:
         ]
 
     def _lasting(self, begins: Mask, od: Array, usual: Mask, short: Mask, limit: Array) -> Mask:
-        """Reactors in which full feed does not reach the setpoint, shape (N,).
-
-        Args: begins: a sum says so now. short: fed in full and above the setpoint. limit: of a fall of ln OD.
-        """
+        """Reactors in which full feed does not reach the setpoint: from when a sum says so until that has eased."""
         highest = np.fmax(self._helpless_od, np.where(usual, od, -math.inf))
         lasts = np.isfinite(self._helpless_od)
         with np.errstate(invalid="ignore", divide="ignore"):

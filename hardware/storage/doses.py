@@ -132,10 +132,9 @@ def feeds_by(row: Mapping[str, Any]) -> str:
 def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
     """Every dose of a journal with what it really gave, and what the device repeated of it, in the order of time.
 
-    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; what the
-    device repeated of it is told by the `dose_end` that a resumed run writes.
-
-    Args: rows: of a journal, oldest first. Raises: RecordingError for a row that is not as the driver wrote it.
+    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; a
+    resumed run's `dose_end` tells what was repeated of it. Raises: RecordingError for a row that is not as the driver
+    wrote it.
     """
     given: dict[int, Dosed] = {}  # by the row of the intent
     begun: dict[str, Dosed] = {}  # by reactor, the one that has not ended
