@@ -27,7 +27,7 @@ CYCLE_S = 56.0  # sooner no sample follows another
 
 
 class WatchedChiBio(Watched):
-    """One reactor that is regulated by the device or somebody; get sends a GET, every poll_s; its feed pump has a flow."""
+    """One reactor that the device or somebody regulates, read by `get` every poll_s; flow_ml_s: of its feed pump."""
 
     def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float, poll_s: float) -> None:
         super().__init__((name,))
