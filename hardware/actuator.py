@@ -14,9 +14,8 @@ class Actuator:
     the interlock and its ledger. A temperature stands in place of the schedule's. Any other command reaches the
     reactors as `Command.targets[name]`.
 
-    name: by which a signal says it. unit: of a command. low, high: limits, to which the interlock cuts a command; those
-    of a fluid are 0 and the bench's largest rate, those of the thermostat are settings of the interlock.
-    pump: number of the pump, 0 for what is no fluid.
+    low, high: limits in its unit, to which the interlock cuts a command; those of a fluid are 0 and the bench's largest
+    rate, those of the thermostat are settings of the interlock. pump: its number, 0 for what is no fluid.
     """
 
     name: str

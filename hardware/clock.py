@@ -30,21 +30,17 @@ class RealClock:
         self._start = uptime()
 
     def now(self) -> float:
-        """Real seconds."""
         return uptime() - self._start
 
     def sleep(self, seconds: float) -> None:
-        """Wait real seconds."""
         if seconds > 0.0:
             time.sleep(seconds)
 
 
 class DeviceClock:
-    """Device time, for samples, doses and the run: `speed` device seconds pass in one real second.
+    """Device time, for samples, doses and the run: `speed` device seconds pass in one real second, 1 on the bench.
 
-    No other module converts between the two.
-
-    Args: speed: 1 on the bench. real: clock that it runs on; None: the machine's.
+    No other module converts between the two. Args: real: clock that it runs on; None: the machine's.
     Raises: ValueError if speed is not positive.
     """
 
@@ -54,11 +50,9 @@ class DeviceClock:
         self.real, self._speed = real or RealClock(), speed
 
     def now(self) -> float:
-        """Device seconds."""
         return self.of_real(self.real.now())
 
     def sleep(self, seconds: float) -> None:
-        """Wait device seconds."""
         self.real.sleep(self.to_real(seconds))
 
     def of_real(self, real_s: float) -> float:
@@ -77,11 +71,9 @@ class VirtualClock:
         self._now = start
 
     def now(self) -> float:
-        """Virtual seconds."""
         return self._now
 
     def sleep(self, seconds: float) -> None:
-        """Advance virtual time."""
         if seconds > 0.0:
             self._now += seconds
 

@@ -97,7 +97,6 @@ class Opening:
 
     @property
     def began(self) -> float:
-        """When the run began, s since 1970."""
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
     def elapsed_s(self, speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf) -> float:
@@ -114,13 +113,10 @@ class Opening:
 class Family:
     """One kind of reactor. What a kind of one's own must give is `config` and `open`; the rest has defaults.
 
-    Attributes:
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`. It needs `kind`, the name of the
-        family, and `reactors`, their names.
-      can: what its reactors can do.
-      called: its reactors, for a reader.
-      at_stake: a culture is: a policy that is doubtful or not certified is refused.
-      simulated: its vials are of `plant`, in this process and in virtual time, and the program knows their truth.
+    Attributes: config, dataclass of its values, whose fields are made by `conf.schema.setting`; it needs `kind`, the
+      name of the family, and `reactors`, their names. can: what its reactors can do. called: its reactors, for a
+      reader. at_stake: a culture is: a policy that is doubtful or not certified is refused. simulated: its vials are of
+      `plant`, in this process and in virtual time, and the program knows their truth.
     """
 
     config: type[Any]
@@ -140,10 +136,8 @@ class Family:
     def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
         """Check what a run needs, a line for each thing; opens and closes what that takes. Raises: ReactorError.
 
-        A family that does not say how is opened as for a run; each reactor is sampled once, and its pumps are verified
-        off.
-
-        Args: folder: where the run will write.
+        A family that does not say how is opened as for a run, which writes into `folder`; each reactor is sampled once,
+        and its pumps are verified off.
         """
         checks: list[Check] = []
         with tempfile.TemporaryDirectory() as name, closing(Journal(Path(name) / "journal.jsonl", fsync=False)) as rows:
@@ -178,11 +172,7 @@ class Family:
         """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
 
     def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
-        """Whether spare pumps can give doses, and these are large enough.
-
-        Args: pumps: numbers of those that each reactor is fed by. who: asks for that, a key.
-        Raises: UnfitError.
-        """
+        """Whether spare pumps (numbers, per reactor) can give large doses to `who`, a key. Raises: UnfitError."""
         if not any(pumps):
             return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
@@ -207,10 +197,7 @@ class Family:
         return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
     def holding(self, backend: Any, preset: str, **values: Any) -> Any:
-        """Put a preset of vials into a config that simulates vials of its own, where none was chosen.
-
-        Args: values: further ones of the config.
-        """
+        """Put a preset of vials, and values, into a config that simulates vials of its own, where none was chosen."""
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
@@ -218,7 +205,6 @@ class Family:
         return None
 
     def sees_fluorescence(self, backend: Any) -> bool:
-        """Whether a device is told to measure fluorescence."""
         return False
 
     def seeing_fluorescence(self, backend: Any) -> Any:
@@ -230,10 +216,7 @@ class Family:
         return math.inf
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s.
-
-        Args: reactors: as opened.
-        """
+        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s."""
         return None, 1.0
 
     def address(self, backend: Any) -> str:
@@ -250,7 +233,6 @@ class Family:
 
 
 def _looked_at(reactors: Reactor) -> Iterator[Check]:
-    """Take a sample of each reactor, and verify its pumps off. Raises: ReactorError."""
     n = len(reactors.names)
     yield Check("reactors", True, f"{', '.join(reactors.names)} opened")
     try:
@@ -293,7 +275,6 @@ _loaded: dict[str, Family] = {}
 
 
 def known() -> list[str]:
-    """List the name of every kind."""
     return list(dict.fromkeys([*SHIPPED, *_loaded]))
 
 
@@ -307,7 +288,6 @@ def family(kind: str) -> Family:
 
 
 def family_of(backend: Any) -> Family:
-    """Return the family that a backend's config is of."""
     return family(backend.kind)
 
 

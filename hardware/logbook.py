@@ -15,18 +15,14 @@ Log = Callable[[str, Mapping[str, Any]], None]
 screen = logging.getLogger(__name__)
 
 
-def no_log(kind: str, fields: Mapping[str, Any]) -> None:
-    """Keep nothing."""
+def no_log(kind: str, fields: Mapping[str, Any]) -> None: ...
 
 
 class Logbook:
     """One reactor's journal, notes and fault.
 
-    Args:
-      name: of the reactor, the `reactor` of every row.
-      log: takes a row; must never raise (see `hardware.stations`).
-      write: takes a row that must be on the disk before what it speaks of is done, e.g. an intent; may raise.
-      elapsed: run time, s.
+    Args: log: takes a row; must never raise (see `hardware.stations`). write: takes a row that must be on the disk
+      before what it speaks of is done, e.g. an intent; may raise. elapsed: run time, s.
     Attributes: fault; news, whether its kind changed since someone last looked; notes for the next receipt.
     """
 
@@ -38,7 +34,6 @@ class Logbook:
         self._log, self._write = log, write
 
     def log(self, kind: str, **fields: Any) -> None:
-        """Write a row."""
         self._log(kind, {"reactor": self.name, **fields})
 
     def write(self, kind: str, **fields: Any) -> None:

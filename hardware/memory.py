@@ -30,8 +30,7 @@ class Remembers(Protocol):
     """
 
     @property
-    def remembers(self) -> tuple[str, ...]:
-        """The keys of its state."""
+    def remembers(self) -> tuple[str, ...]: ...
 
 
 def save(owner: Remembers) -> dict[str, Any]:
@@ -107,7 +106,6 @@ def _plain(value: Any) -> Any:
 
 
 def _fitted(now: NDArray[Any], key: str, value: Any) -> NDArray[Any]:
-    """Convert a saved value to an array like `now`. Raises: ValueError."""
     types, what = KINDS[now.dtype.kind]
     try:
         given = np.array(value, dtype=object)

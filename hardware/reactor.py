@@ -110,7 +110,8 @@ class Reactor(Protocol):
 
     @property
     def handed_over(self) -> Mask:
-        """Reactors that the device's own regulation has been given for good, shape (N,)."""
+        """Reactors that the device's own regulation has been given for good, shape (N,); by default none."""
+        return np.zeros(len(self.names), dtype=np.bool_)
 
     def measure(self) -> Measurement:
         """Wait for a new sample of at least one reactor, or, when none comes in time, return with none fresh.
@@ -124,6 +125,7 @@ class Reactor(Protocol):
 
     def repeated(self) -> list[tuple[float, Receipt]]:
         """Return what was given beyond the receipts, or less where negative: run time, s, and volumes, in order."""
+        return []
 
     def elapsed(self) -> float:
         """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
@@ -133,6 +135,7 @@ class Reactor(Protocol):
 
     def give_up(self, rows: Mask) -> list[str]:
         """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed, as `pumps_off`."""
+        return self.pumps_off(rows)
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
@@ -154,10 +157,7 @@ class KeepsLevels(Protocol):
 
 @contextmanager
 def left_off(reactors: Reactor) -> Iterator[None]:
-    """Leave all pumps off and verified where this context ends by an error or a stop, or say that they are not.
-
-    Raises: what ended it; NotLeftOff naming the pumps that could not be verified off.
-    """
+    """Leave all pumps off and verified where this context ends by an error or a stop. Raises: that; NotLeftOff."""
     try:
         yield
     except BaseException as error:

@@ -16,10 +16,7 @@ __all__ = ["FAMILY", "SimulatedConfig", "SimulatedFamily", "SimulatedReactors"]
 
 @dataclass(frozen=True)
 class SimulatedConfig:
-    """`backend=sim`: simulated vials in this process, in virtual time.
-
-    Raises: ValueError naming key, value and allowed range.
-    """
+    """`backend=sim`: simulated vials in this process, in virtual time. Raises: ValueError naming key and range."""
 
     kind: str = setting("sim", "backend")
     reactors: tuple[str, ...] = setting(("M0",), "names of the simulated vials", some=True)
@@ -32,12 +29,10 @@ class SimulatedConfig:
         require(unique, "backend.reactors", self.reactors, "one or more unique names")
 
 
-class SimulatedReactors:
+class SimulatedReactors(Reactor):
     """`Reactor` in front of a plant: a cycle is sample, decide, dose, grow for the rest of the control period.
 
-    Args:
-      plant: N vials, reset to the state the run starts from.
-      config: names and what the pump is believed to deliver. control_min: between samples, min.
+    Args: plant: N vials, reset to the state the run starts from. control_min: between samples, min.
     """
 
     def __init__(self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0) -> None:
@@ -51,7 +46,6 @@ class SimulatedReactors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """As configured."""
         return self.config.reactors
 
     def measure(self) -> Measurement:
@@ -70,19 +64,13 @@ class SimulatedReactors:
         )
 
     def actuate(self, command: Command) -> Receipt:
-        """Dose once within the coming control period. Raises: nothing."""
         volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.control_min
         self._feed_s = volume / self.config.pump_ml_s
         asked = command.rows & ~np.isnan(command.temperature)
         self._target = np.where(asked, command.temperature, self._target)
         return Receipt(volume_ml=volume)
 
-    def repeated(self) -> list[tuple[float, Receipt]]:
-        """None ever is."""
-        return []
-
     def elapsed(self) -> float:
-        """Run time, s."""
         return 60.0 * self._minutes
 
     def pumps_off(self, rows: Mask) -> list[str]:
@@ -90,22 +78,12 @@ class SimulatedReactors:
         self._feed_s = np.where(rows, 0.0, self._feed_s)
         return []
 
-    @property
-    def handed_over(self) -> Mask:
-        """None ever is."""
-        return np.zeros(self.plant.n, dtype=np.bool_)
-
-    def give_up(self, rows: Mask) -> list[str]:
-        """As `pumps_off`."""
-        return self.pumps_off(rows)
-
     def heat_off(self, rows: Mask) -> list[str]:
         """Switch the heater of `rows` off until a temperature is commanded. Nothing can fail."""
         self._target = np.where(rows, 0.0, self._target)
         return []
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """There is no device that could regulate by itself."""
         self.pumps_off(rows)
         return [
             f"{name}: no on-board regulation in simulation, pumps off"
@@ -114,7 +92,6 @@ class SimulatedReactors:
         ]
 
     def stop(self) -> None:
-        """No dose is pending any more."""
         self._feed_s = np.zeros(self.plant.n)
 
 
@@ -129,28 +106,23 @@ class SimulatedFamily(Family):
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:
-        """Vials of `opening.plant`."""
         backend, bench = opening.backend, opening.bench
         volumes_ml = bench.volumes(backend.reactors)
         vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed), volumes_ml)
         yield SimulatedReactors(vials, backend, bench.control_min)
 
     def vials(self, backend: SimulatedConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
-        """Those of deploy's `plant`."""
         return "plant", plant
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """Return the vials themselves, and `pump_ml_s`."""
         if not isinstance(reactors, SimulatedReactors):
             return None, 1.0
         return reactors.plant, reactors.config.pump_ml_s
 
     def address(self, backend: SimulatedConfig) -> str:
-        """In this process."""
         return "in this computer"
 
     def start_od(self, backend: SimulatedConfig, plant: PlantConfig) -> float:
-        """Return the start OD of the vials."""
         return plant.start_od
 
 

@@ -3,6 +3,7 @@
 A family gives a `Station` per reactor and says in a subclass what it does between two of them and while it waits.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -14,29 +15,26 @@ from hardware.errors import ReactorError
 from hardware.logbook import Log, Logbook
 from hardware.messages import PumpsNotOff
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
-from hardware.storage.doses import Given
 from hardware.storage.history import History
 
-__all__ = ["Newest", "Plan", "Stations"]
+__all__ = ["Newest", "Plan", "Station", "Stations"]
 
 AGAIN_S = 20.0  # from one `measure` without a sample to the next, while there is none
 
 
-@dataclass(frozen=True)
 class Newest:
     """The newest sample of one reactor; nan where there is none.
 
-    at: when it was taken, clock time, s. temperature: degC. raw, blank: counts; blank None where the device has none.
-    fluorescence: counts; None where it is not measured. arrived_s: clock time at which it was seen.
+    Attributes: at, when it was taken, clock time, s; od; temperature, degC; raw, blank, counts, blank None where the
+      device has none; fluorescence, counts, None where it is not measured; arrived_s, clock time from which its age
+      counts; next_look, clock time at which the reactor is to be looked at again.
     """
 
-    at: float
-    od: float
-    temperature: float
-    raw: float
-    arrived_s: float
-    blank: float | None = None
-    fluorescence: float | None = None
+    def __init__(self, now: float) -> None:
+        self.at = self.od = self.temperature = self.raw = math.nan
+        self.blank: float | None = None
+        self.fluorescence: float | None = None
+        self.arrived_s, self.next_look = now, -math.inf
 
 
 @dataclass(frozen=True)
@@ -48,34 +46,24 @@ class Plan:
     carry_ml: float = 0.0
 
 
-class AnyDoses(Protocol):
-    """carry_ml: put off to the next dose. extra: what was given beyond what was booked when doses began."""
-
-    extra: list[Given]
-
-    @property
-    def carry_ml(self) -> float: ...
-
-
 class Station(Protocol):
-    """One reactor.
+    """One reactor. What switches something off or over may return a course, which the family goes through.
 
-    newest: its newest sample. next_look: clock time at which it is to be looked at again. handed_over: the device
-    regulates it for good. What switches something off or over may return a course, which the family goes through.
+    Attributes: doses, with carry_ml, put off to the next, and extra, what was given beyond what was booked when doses
+      began; sampling, its newest sample; regulated_od, OD at which it was handed over to the device's own regulation,
+      nan while this program controls.
     """
 
+    name: str
     book: Logbook
+    doses: Any
+    sampling: Any
+    regulated_od: float = math.nan
 
     @property
-    def name(self) -> str: ...
-    @property
-    def doses(self) -> AnyDoses: ...
-    @property
-    def newest(self) -> Newest: ...
-    @property
-    def next_look(self) -> float: ...
-    @property
-    def handed_over(self) -> bool: ...
+    def handed_over(self) -> bool:
+        """Whether the device regulates it for good."""
+        return math.isfinite(self.regulated_od)
 
     def poll(self) -> bool: ...
 
@@ -115,16 +103,13 @@ class Stations(Generic[S, H]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One per reactor, e.g. ("M0", "M1")."""
         return tuple(station.name for station in self.stations)
 
     @property
     def handed_over(self) -> Mask:
-        """Reactors that the device's own regulation has been given for good, shape (N,)."""
         return np.array([station.handed_over for station in self.stations])
 
     def elapsed(self) -> float:
-        """Run time, s: counted from `begin`, together with what had passed before."""
         return self._clock.now() - self._zero
 
     def begin(self, histories: Mapping[str, H] | None = None, elapsed_s: float = 0.0) -> None:
@@ -143,8 +128,6 @@ class Stations(Generic[S, H]):
         """Every reactor as an earlier life left it, then into its running state. Raises: as `begin`."""
         raise NotImplementedError
 
-    # ------------------------------------------------------------------------------------------------- measurement
-
     def measure(self) -> Measurement:
         """Return the newest samples; wait for one, doing what is due meanwhile.
 
@@ -152,30 +135,28 @@ class Stations(Generic[S, H]):
         (again every 20 s while that lasts): `vitals` then says what is wrong.
         Raises: what the log raised; nothing for trouble with device or link.
         """
-        last = max(station.newest.arrived_s for station in self.stations)
+        last = max(station.sampling.arrived_s for station in self.stations)
         deadline = max(last + self._stale_s, self._clock.now() + AGAIN_S)
         fresh = np.zeros(len(self.stations), dtype=np.bool_)
         while True:
             self._between()
             for i, station in enumerate(self.stations):
-                if self._clock.now() >= station.next_look:
+                if self._clock.now() >= station.sampling.next_look:
                     fresh[i] = station.poll()
                     self._between()
             self.raise_late()
             now = self._clock.now()
             if fresh.any() or now >= deadline or any(station.book.news for station in self.stations):
                 return self._measurement(fresh)
-            self._wait(min([deadline, *(station.next_look for station in self.stations)]) - now)
+            self._wait(min([deadline, *(station.sampling.next_look for station in self.stations)]) - now)
 
-    def _between(self) -> None:
-        """Do what is due between two reactors."""
+    def _between(self) -> None: ...
 
     def _wait(self, longest_s: float) -> None:
-        """Wait a little, not longer than `longest_s`."""
         raise NotImplementedError
 
     def _measurement(self, fresh: Mask) -> Measurement:
-        newest = [station.newest for station in self.stations]
+        newest: list[Newest] = [station.sampling for station in self.stations]
 
         def column(key: str) -> Array:
             return np.array([getattr(one, key) for one in newest], dtype=np.float64)
@@ -189,8 +170,6 @@ class Stations(Generic[S, H]):
         vitals = Vitals(self._clock.now() - column("arrived_s"), column("raw"), faults, column_or_none("blank"))
         time_s, light = column("at") - self._zero, column_or_none("fluorescence")
         return Measurement(time_s, column("od"), column("temperature"), fresh, vitals, light)
-
-    # --------------------------------------------------------------------------------------------------- actuation
 
     def actuate(self, command: Command) -> Receipt:
         """Begin one dose per row of `command.rows`, targets first; its end is carried out by `measure`.
@@ -229,18 +208,13 @@ class Stations(Generic[S, H]):
         return self._each(rows, lambda station: station.pumps_off())
 
     def give_up(self, rows: Mask) -> list[str]:
-        """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed."""
         return self._each(rows, lambda station: station.give_up())
 
     def heat_off(self, rows: Mask) -> list[str]:
-        """Heating of `rows` off for the rest of the run; returns what failed."""
         return self._each(rows, lambda station: station.heat_off())
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand `rows` over to the device's own regulation at `setpoint` (OD, shape (N,)); returns what failed.
-
-        The reactor then feeds itself; commands for it are refused from here on.
-        """
+        """Hand `rows` over to the device's own regulation at `setpoint`, OD, (N,), for good; returns what failed."""
         targets = dict(zip(self.names, setpoint, strict=True))
         return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
 
@@ -249,11 +223,9 @@ class Stations(Generic[S, H]):
         return self._lines(self._all(chosen, action))
 
     def _lines(self, failed: Mapping[S, ReactorError]) -> list[str]:
-        """List what failed, in the order of the reactors."""
         return [f"{station.name}: {failed[station]}" for station in self.stations if station in failed]
 
     def _all(self, stations: Sequence[S], action: Callable[[S], Any]) -> dict[S, ReactorError]:
-        """Carry `action` out at each station; what failed."""
         failed: dict[S, ReactorError] = {}
         for station in stations:
             try:
@@ -263,10 +235,7 @@ class Stations(Generic[S, H]):
         return failed
 
     def stop(self) -> None:
-        """All pumps off, verified, but those of a reactor that was handed over; the rest goes on. Idempotent.
-
-        Raises: PumpsNotOff naming every reactor whose pumps could not be verified off, and what to do.
-        """
+        """All pumps off, verified, but those of a reactor that was handed over. Idempotent. Raises: PumpsNotOff."""
         failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
         self.note_down("stop", {"reactors": self.names, "not_verified": failed})
         if failed:
@@ -275,8 +244,6 @@ class Stations(Generic[S, H]):
     def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
         """All pumps of these off for good; what could not be verified."""
         raise NotImplementedError
-
-    # ----------------------------------------------------------------------------------------------------- journal
 
     def raise_late(self) -> None:
         """Raise what the log raised where it must not stand in the way of a pump-off; once."""

@@ -1,6 +1,5 @@
 """Reactors that are read and cannot act, and the interlock over them, which only tells."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hardware.messages import Fault
-from hardware.reactor import Array, Command, Mask, Measurement, Receipt
+from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
@@ -21,13 +20,7 @@ LASTING = 3  # samples in a row: a single odd reading withholds no dose here
 class WatchedSafety(SafetyConfig):
     """Limits beside a device that the interlock cannot stop."""
 
-    @classmethod
-    def of(cls, safety: SafetyConfig) -> "WatchedSafety":
-        """Take the limits of another config."""
-        return cls(**{f.name: getattr(safety, f.name) for f in fields(safety)})
-
     def response(self, fault: Fault | type[Fault]) -> Response:
-        """See `SafetyConfig.response`; at most no dose for this sample."""
         return min(super().response(fault), Response.HOLD)
 
 
@@ -35,13 +28,12 @@ class WatchedInterlock(Interlock):
     """Tells of what lasts, and expects none of the doses that it allows. Arguments as of `Interlock`."""
 
     def __init__(self, n: int, config: SafetyConfig, *args: Any) -> None:
-        super().__init__(n, WatchedSafety.of(config), *args)
+        super().__init__(n, WatchedSafety(**{f.name: getattr(config, f.name) for f in fields(config)}), *args)
         self._stood: list[dict[str, int]] = [{} for _ in range(n)]
 
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
     ) -> Ruling:
-        """See `Interlock.check`."""
         ruling = super().check(measurement, rate, setpoint, temperature_target, now)
         self.budget.grant(-ruling.rate)
         reasons = list(ruling.reasons)
@@ -52,21 +44,13 @@ class WatchedInterlock(Interlock):
         return replace(ruling, reasons=reasons)
 
 
-class Watched(ABC):
-    """N reactors that somebody else regulates, as a `Reactor`. What goes in is evidence, told by `repeated`."""
+class Watched(Reactor):
+    """N reactors that somebody else regulates. What goes in is evidence, told by `repeated`."""
+
+    names: tuple[str, ...] = ()
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
-        self.handed_over = np.zeros(len(self.names), dtype=np.bool_)
-        self._seen: list[tuple[float, Receipt]] = []
-
-    @abstractmethod
-    def measure(self) -> Measurement:
-        """See `Reactor.measure`."""
-
-    @abstractmethod
-    def elapsed(self) -> float:
-        """See `Reactor.elapsed`."""
+        self.names, self._seen = tuple(names), list[tuple[float, Receipt]]()
 
     def seen(self, at_s: float, volume_ml: Array) -> None:
         """Tell of doses that were seen, mL, (N,), at a run time, s."""
@@ -74,23 +58,19 @@ class Watched(ABC):
             self._seen.append((at_s, Receipt(volume_ml)))
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Return the doses that were seen since this was last called."""
         seen, self._seen = self._seen, []
         return seen
 
     def actuate(self, command: Command) -> Receipt:
-        """Give nothing."""
         return Receipt(np.zeros(len(self.names)))
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """Switch nothing."""
         return []
 
     give_up = heat_off = pumps_off
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand nothing over."""
         return []
 
-    def stop(self) -> None:  # noqa: B027 (there is nothing to stop)
+    def stop(self) -> None:
         """Leave everything as it is."""

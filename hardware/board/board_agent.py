@@ -256,7 +256,6 @@ class BoardAgent:
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def start(self) -> None:
-        """Start watching."""
         self._thread.start()
 
     def claim(self, line: str, session: int, arm: bool = True) -> str:
@@ -362,7 +361,6 @@ class BoardAgent:
         return problems
 
     def _state(self) -> dict:  # type: ignore[type-arg]
-        """Read the selected reactor's state. Raises: Unanswered, ValueError for an answer that is not JSON."""
         status, body, _ = self.device.request("GET", "/getSysdata/")
         if status != 200:
             raise ValueError(f"getSysdata answered {status}")
@@ -421,7 +419,6 @@ class SerialPort:
         self._stop.set()
 
     def run(self) -> None:
-        """Serve until `stop`."""
         pause = BACKOFF_S[0]
         while not self._stop.is_set():
             try:
@@ -458,7 +455,6 @@ class SerialPort:
         return descriptor
 
     def _serve(self, descriptor: int) -> None:
-        """Lines in, replies out. Raises: OSError when the line is gone."""
         waiting = b""
         while not self._stop.is_set():
             if not select.select([descriptor], [], [], 0.5)[0]:
@@ -583,7 +579,6 @@ class Proxy(socketserver.ThreadingTCPServer):
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """And its place is free again."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -605,12 +600,9 @@ def encode_answer(status: int, body: bytes, kind: str) -> bytes:
 
 
 class ProxyHandler(socketserver.BaseRequestHandler):
-    """One request of a client."""
-
     server: Proxy
 
     def handle(self) -> None:
-        """Read, answer, close."""
         with contextlib.suppress(OSError):  # the client is gone
             try:
                 answer = self._answer(*parse_head(self._head()))
@@ -644,7 +636,6 @@ class ProxyHandler(socketserver.BaseRequestHandler):
         return bytes(data.partition(b"\r\n\r\n")[0])
 
     def _answer(self, method: str, path: str, fields: dict[str, str]) -> tuple[int, bytes, str]:
-        """Status, body and its kind. Raises: Refusal."""
         agent, session = self.server.agent, self._admit(fields)
         if (method, path) == ("GET", "/_agent/status"):
             return 200, agent.status(), "application/json"
@@ -688,7 +679,6 @@ class ProxyHandler(socketserver.BaseRequestHandler):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of the program."""
     p = argparse.ArgumentParser(description="Carries requests to the Chi.Bio server; turns pumps off in silence.")
     p.add_argument("--tty", help="serial line to serve, e.g. /dev/ttyGS0")
     p.add_argument("--baud", type=int, default=115200, help="line rate (default %(default)s)")

@@ -28,9 +28,8 @@ class Agenda:
         heapq.heappush(self._queue, (self._clock.now() + delay_s, next(self._order), task))
 
     def run_due(self, until: float | None = None) -> None:
-        """Run every step that is due at clock time `until`, by default now.
+        """Run every step that is due at clock time `until`, by default now; what becomes due meanwhile waits.
 
-        What becomes due meanwhile waits for the next call, or slow steps would never end.
         Raises: what a step raises; call again with the same `until` for the rest.
         """
         until = self._clock.now() if until is None else until
@@ -45,7 +44,6 @@ class Agenda:
         return self._queue[0][0] if self._queue else float("inf")
 
     def clear(self) -> None:
-        """Forget all tasks."""
         for _, _, task in self._queue:
             task.close()
         self._queue.clear()

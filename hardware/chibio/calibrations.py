@@ -18,10 +18,7 @@ PARTS = ("feed", "waste", "blank")
 
 
 def save_calibration(folder: Path, reactor: str, part: str, values: Mapping[str, Any]) -> Path:
-    """Write FOLDER/REACTOR_PART.yaml, whole or not at all; returns its path.
-
-    Args: part: feed, waste or blank. Raises: UnfitError if the folder cannot be written.
-    """
+    """Write FOLDER/REACTOR_PART.yaml (feed, waste, blank), whole or not at all; return its path. Raises: UnfitError."""
     path = folder / f"{reactor}_{part}.yaml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -44,10 +41,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
-    """Pumps and blanks of `reactors`; what was never measured is nominal, and its blank is nan (the device's own).
-
-    Raises: UnfitError naming the file and what is wrong with it.
-    """
+    """Pumps and blanks of reactors; what was never measured is nominal, and its blank nan. Raises: UnfitError."""
     calibrations = []
     for name in reactors:
         feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)

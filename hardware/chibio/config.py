@@ -8,17 +8,14 @@ from hardware.chibio.dosing import DosingConfig, SupplyConfig
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS, Permitted
-from hardware.link.transport import WEB_ADDRESS, TransportConfig, web_address
+from hardware.link.transport import TransportConfig, require_web_address
 
 __all__ = ["ChiBioConfig", "EmulatorConfig"]
 
 
 @dataclass(frozen=True)
 class ChiBioConfig:
-    """How to reach a Chi.Bio, which reactors to run and how.
-
-    Raises: ValueError naming key, value and allowed range.
-    """
+    """How to reach a Chi.Bio, which reactors to run and how. Raises: ValueError naming key, value and allowed range."""
 
     kind: str = setting("chibio", "backend")
     url: str = setting("http://192.168.7.2:5000", "address of the device's server")
@@ -60,7 +57,7 @@ class ChiBioConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend")
-        require(web_address(self.url), "backend.url", repr(self.url), WEB_ADDRESS)
+        require_web_address("backend.url", self.url)
         unique = len(set(self.reactors)) == len(self.reactors)
         require(unique, "backend.reactors", self.reactors, "1 to 8 different ones of M0 to M7")
         both = self.overflow_pump.pump in self.supply.pumps
@@ -70,7 +67,6 @@ class ChiBioConfig:
 
     @property
     def permitted(self) -> Permitted:
-        """What a client of this config may send."""
         return Permitted(self.reactors, self.overflow_pump.pump, self.fluorescence.command, self.supply.pumps)
 
 

@@ -23,11 +23,7 @@ DRAIN = 0.25
 
 
 def identity(transport: Transport, clock: Clock, where: str) -> str:
-    """Identity of the first reactor that is present: the same by whatever name or link a device is reached.
-
-    Args: where: address of the link, for a message.
-    Raises: LinkError, ProtocolError; DeviceStateError if there is no reactor.
-    """
+    """Identity of the first reactor that is present, by whatever link (`where`). Raises: as `Connection.read`."""
     reply = transport.get("/getSysdata/")
     if reply.status != 200:
         raise messages.WrongStatus(request=f"{where}: GET /getSysdata/", status=reply.status, expected=200)
@@ -94,10 +90,7 @@ class Connection:
         return state
 
     def _look(self) -> DeviceState:
-        """Read the state of the selected reactor, which tells of all whether they are present.
-
-        Raises: LinkError, ProtocolError; DeviceStateError if this one is absent.
-        """
+        """Read the state of the selected reactor, which tells of all whether they are present. Raises: as `read`."""
         before, self._unsure = self._unsure, True
         reply = self._transport.get("/getSysdata/")
         if reply.status != 200:
@@ -132,11 +125,7 @@ class Connection:
         self._seen_s = self.clock.now()
 
     def toggle(self, path: str) -> DeviceState:
-        """Send a toggle of the selected reactor right after a read of this one; the state after it.
-
-        Another client that selects a reactor in between would have that one toggled: look at the state returned.
-        Raises: as `read` and `post`.
-        """
+        """Send a toggle of the selected reactor right after a read of this one; return the state then."""
         self.read()
         self._post(path)
         return self.read()
@@ -177,14 +166,11 @@ class Connection:
         self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
 
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """Switch these pumps off, verified. Each is tried even if another one fails, unless nothing answers at all.
+        """Switch these pumps off, verified; the waste pump last, as it runs where a feed pump may.
 
-        The waste pump goes off last, after every feed pump was heard to: where one may run, it runs too.
-
-        Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
-        So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
-        server's worker, whose end switches everything off: the remote kill switch (docs/device.md, Failures).
-
+        Each is tried even if another one fails, unless nothing answers. Read-back alone proves nothing, for the flags
+        are intent: with the bus hung they say off while the motor runs. So a blocking call touches the bus in between.
+        On a hung bus it outlasts the server's worker, whose end switches everything off (docs/device.md, Failures).
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """
         for attempt in range(tries):

@@ -17,7 +17,6 @@ def regulates(state: DeviceState, setpoint: float) -> bool:
 
 
 def describe(state: DeviceState) -> str:
-    """Describe what the on-board regulation does."""
     return f"on-board OD regulation is {'on' if state.regulating else 'off'}, target {state.regulation_target:g}"
 
 
@@ -27,12 +26,10 @@ def diagnose(
 ) -> Fault | None:  # fmt: skip
     """Find the gravest fault that a verified state shows, against how the reactor should be found.
 
-    Args:
-      age_s: of the newest sample, s. start_time: of its experiment. blank: counts.
-      setpoint: OD at which it was handed over to the on-board regulation, nan if this program controls.
-      dosing: its pumps may be on. stuck: why its pumps could not be verified off, "" if they were.
-      ended: why this program ended its experiment, "" if it did not.
-      overflow_trouble: why its overflow pump could not be verified on, None if it was.
+    Args: age_s: of the newest sample, s. start_time: of its experiment. blank: counts. setpoint: OD at which it was
+      handed over to the on-board regulation, nan if this program controls. dosing: its pumps may be on. stuck: why its
+      pumps could not be verified off, ended: why this program ended its experiment, "" if not. overflow_trouble: of its
+      overflow pump.
     """
     if state.start_time != start_time or not state.started:
         return messages.ExperimentGone(start_time=start_time, cycles=state.cycles, blank=state.blank)

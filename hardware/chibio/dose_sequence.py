@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from hardware.logbook import Logbook
 from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
-__all__ = ["Context", "DoseSequence"]
+__all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
@@ -36,30 +36,14 @@ def _change(before: float, now: float) -> Message | None:
     return None if same else messages.TargetChanged(before=before, now=now)
 
 
-@dataclass(frozen=True)
-class Context:
-    """One reactor's surroundings.
-
-    connection: its verified conversation. volume_ml: of its culture. calibration: of its pumps and its zero. config,
-    agenda: shared by all reactors; what must happen later is put on the agenda. book: what it reports. past: gives what
-    this run knows of the reactor by the rows that it wrote, those of earlier lives too.
-    """
-
-    connection: Connection
-    volume_ml: float
-    calibration: ReactorCalibration
-    config: ChiBioConfig
-    agenda: Agenda
-    book: Logbook
-    past: Callable[[], ReactorHistory]
-
-
 class DoseSequence:
     """The doses of one reactor, one at a time, at most one per sample.
 
     A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
+    Args: agenda: shared by all reactors; what must happen later is put on it. past: gives what this run knows of the
+      reactor by the rows that it wrote, those of earlier lives too.
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
       what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
@@ -67,10 +51,12 @@ class DoseSequence:
       dose was last seen or told.
     """
 
-    def __init__(self, context: Context) -> None:
-        self._connection, self._calibration, self._config = context.connection, context.calibration, context.config
-        self._agenda, self._book, self._past = context.agenda, context.book, context.past
-        self._clock = context.connection.clock
+    def __init__(
+        self, connection: Connection, calibration: ReactorCalibration, config: ChiBioConfig, agenda: Agenda,
+        book: Logbook, past: Callable[[], ReactorHistory],
+    ) -> None:  # fmt: skip
+        self._connection, self._calibration, self._config = connection, calibration, config
+        self._agenda, self._book, self._past, self._clock = agenda, book, past, connection.clock
         self.running = False
         self.stuck = ""
         self.escalated = False
@@ -111,16 +97,11 @@ class DoseSequence:
         refusal: Message | None,
         pump: str = FEED,
     ) -> DosePlan:
-        """Begin the dose for `sample`; returns what was, or may have been, begun.
+        """Begin the dose for `sample`; return what was, or may have been, begun. A note says why nothing was.
 
-        Nothing is begun, and a note says why, if that sample was acted on already, is too old for a dose to end
-        before the next measurement, or the reactor may not be dosed at all.
-
-        Args:
-          rate: mean feed rate, mL/s.
-          sample: its key, None if there is none; appeared_s: clock time at which it appeared, -inf if unknown.
-          refusal: why the reactor may not be dosed, None if it may.
-          pump: that gives it: the feed pump, or a supply pump, whose doses are carried nowhere.
+        Args: rate: mean, mL/s. sample: its key, None if there is none. appeared_s: clock time at which it appeared,
+          -inf if unknown. refusal: why the reactor may not be dosed, None if it may. pump: that gives it; only the feed
+          carries.
         Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
         """
         plan = self._plan(rate, pump)
@@ -145,7 +126,6 @@ class DoseSequence:
         return replace(plan_dose(rate, 0.0, self._past().doses, own, self._config.dosing), pump=pump)
 
     def _calibrated(self, pump: str) -> PumpCalibration:
-        """Flow of the pump that feeds."""
         return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> Message | None:
@@ -250,10 +230,10 @@ class DoseSequence:
             yield self._pause_s()
 
     def settle(self, tries: int = 1, overflow_pump: bool = False) -> None:
-        """All pumps off, verified; a dose under way is over then, and so on record.
+        """All pumps off, verified, the overflow pump too if asked; a dose under way is on record then.
 
         After an answer that was missing the device is looked at first: what it shows says what became of the dose.
-        Args: overflow_pump: that one too. Raises: as `Connection.pumps_off`.
+        Raises: as `Connection.pumps_off`.
         """
         connection = self._connection
         try:
@@ -278,11 +258,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """As pumps are found says what became of a dose, so they are looked at before they are switched off.
-
-        They are switched off without that where nothing was missed. That is not so after an answer was missing, and
-        where an earlier life of the program left the dose open.
-        """
+        """Look at pumps before they go off, after a missing answer or where an earlier life left the dose open."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:
@@ -315,10 +291,7 @@ class DoseSequence:
             self._quiet_s = now
 
     def _look(self, state: DeviceState, seen_s: float) -> None:
-        """Write down what a look at the device says of the pumps of an open dose.
-
-        Args: seen_s: run time of the last answer before it, nan if none was missing.
-        """
+        """Write down what a look says of an open dose. Args: seen_s: of the last answer, nan if none was missing."""
         known, now, stopped = self._past(), self._book.elapsed(), None
         if not known.open:
             return
@@ -340,7 +313,6 @@ class DoseSequence:
                 self._book.tell(messages.ChangedInDose(pump=pump, cause=change or messages.RanAgain()))
 
     def _conclude(self, known: ReactorHistory) -> None:
-        """Record the end of a dose; what it gave beyond what was booked when it began waits to be booked."""
         pump = self._calibrated(known.feed_pump)
         ending, note = conclude(known, self._book.elapsed(), pump, self._calibration.waste)
         if note:

@@ -56,7 +56,6 @@ class PumpCalibration:
 
     @property
     def min_dose_ml(self) -> float:
-        """Smallest dose worth giving, mL."""
         return self.volume(self.min_on_s)
 
     @classmethod
@@ -80,7 +79,6 @@ class ReactorCalibration:
 
     @property
     def calibrated(self) -> bool:
-        """Whether both pumps were weighed."""
         return bool(self.feed.date and self.waste.date)
 
 
@@ -118,7 +116,6 @@ class SupplyConfig:
             require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
 
     def calibration(self, pump: str) -> PumpCalibration:
-        """Of a spare pump, as declared."""
         return PumpCalibration(flow_ml_s=self.flow_ml_s(pump), bias_s=self.bias_s)
 
     def flow_ml_s(self, pump: str) -> float:
@@ -131,7 +128,6 @@ class SupplyConfig:
 
     @property
     def pumps(self) -> tuple[str, ...]:
-        """Those that have a tube."""
         return tuple(pump for pump in SPARE if self.flow_ml_s(pump) > 0.0)
 
 
@@ -149,12 +145,10 @@ class DosePlan(Plan):
 
     @property
     def feed_s(self) -> float:
-        """Feed on-time, s."""
         return PERIOD_S * self.feed_duty
 
     @property
     def waste_s(self) -> float:
-        """Waste on-time, s."""
         return PERIOD_S * self.waste_duty
 
 
@@ -164,12 +158,9 @@ def plan_dose(
     """Plan the dose that brings `rate` over one control period, together with what earlier periods left over.
 
     feed duty = (v / q - bias) / 63 with v = rate * period + carry; nothing is dosed while v is below the smallest dose,
-    v is then the new carry. So the mean flow is right even for rates whose single doses the pump cannot deliver, and
-    a carry never exceeds one smallest dose.
-
-    Args:
-      rate: mean feed rate, mL/s, >= 0. carry_ml: of the previous plan, mL.
-      doses: number of feed doses given so far; every `clear_every`-th clears the waste tube.
+    v is then the new carry. So the mean flow is right even for rates whose single doses the pump cannot deliver.
+    Args: rate: mean feed rate, mL/s. carry_ml: of the previous plan, mL. doses: given so far; every `clear_every`-th
+      clears the waste tube.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):
@@ -215,10 +206,8 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
     smallest useful on-time is the shortest one weighed whose mean dose is at least 0.7 of the fitted line, not under
     0.3 s (docs/device.md, Pumps).
 
-    Args:
-      on_s: asked on-time of the series, s, shape (K,), > 0, at least two different values.
-      doses: number of doses, shape (K,), >= 1.
-      grams: mass delivered, g, shape (K,), >= 0.
+    Args: on_s: asked on-time of K series, s, > 0, at least two different ones. doses: their numbers of doses, grams:
+      what they delivered, all of shape (K,).
     Raises: ValueError if the series cannot determine a line, or the fitted pump is out of range.
     """
     t, n, y = (np.asarray(a, dtype=np.float64) for a in (on_s, doses, grams))

@@ -64,7 +64,6 @@ class _Pump:
 
 
 def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
-    """Feed and waste of an open dose."""
     fed_s = known.on_s if known.fed else math.inf
     wasted_s = known.on_s if math.isnan(known.waste_on[0]) else known.waste_on[0]
     feed, waste = (
@@ -84,14 +83,12 @@ def found(
     """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
 
     None takes back what was answered and is not so; then it may be on anew, or the look may be an old answer delivered
-    again, so what was answered stays the least. So it is where another target is found than was set. Nothing is added
-    where the answers have told it. Of a pump that is found off `OFF` says when it went off.
+    again, so what was answered stays the least. So it is where another target is found than was set. Of a pump that is
+    found off `OFF` says when it went off.
 
-    Args:
-      state: as read at run time now_s. seen_s: run time of the last answer before that.
-      silence_s: of this program, after which a board agent, if there is one, switches pumps off.
-      stopped: pump, run time at which an agent says that it found it on and switched it off; None: it does not say.
-      killed: an earlier life of the program left the dose open, and what it sent last is not on record.
+    Args: state: as read at run time now_s. seen_s: run time of the last answer before that. silence_s: of this program,
+      after which a board agent, if there is one, switches pumps off. stopped: pump, run time at which an agent switched
+      it off; None: it does not say. killed: an earlier life left the dose open, what it sent last is not on record.
     """
     added: dict[str, Span | None] = {}
     restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)
@@ -131,10 +128,7 @@ def found(
 def conclude(
     known: ReactorHistory, now_s: float, feed: PumpCalibration, waste: PumpCalibration
 ) -> tuple[Ending, Message | None]:
-    """How the open dose in `known` ended, and what is not as planned, None if nothing is.
-
-    Args: now_s: run time at which its pumps were verified off. feed, waste: the two pumps.
-    """
+    """How the open dose in `known`, verified off at run time now_s, ended, and what is not as planned, or None."""
     fed, wasted = _pumps(known)
     least_s, most_s, anew_s = fed.on_s(now_s)
     low_ml, low_times, low_last_ml = _runs(least_s, fed.dose_s, PERIOD_S + MOTOR_S, feed)
@@ -160,7 +154,6 @@ def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) ->
 
 
 def _words(ending: Ending, known: ReactorHistory) -> Message | None:
-    """Say what is not as planned."""
     ml, low_ml, most_ml = known.feed_ml, ending.feed_low_ml, ending.feed_ml + ending.repeated_ml
     if (times := ending.feed_times) and math.isnan(known.feed_anew[0]):
         return DoseRepeated(ml=ml, times=times, low_ml=low_ml, most_ml=most_ml)

@@ -55,7 +55,6 @@ class ChiBioFamily(Family):
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:
-        """As the family says, and a new run is checked first. Raises: ReactorError."""
         backend, earlier = opening.backend, opening.earlier()
         with ExitStack() as stack:
             with not_looked_at(opening.resumed):
@@ -72,13 +71,11 @@ class ChiBioFamily(Family):
                 yield reactors
 
     def preflight(self, backend: ChiBioConfig, bench: Bench, folder: Path) -> list[Check]:
-        """As `hardware.chibio.preflight`. Raises: ReactorError."""
         calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
         with self.linked(backend, bench) as (transport, clock):
             return preflight(transport, clock, backend, calibrations, folder, bench)
 
     def tube(self, backend: ChiBioConfig, number: int, most_ml: float, who: str) -> None:
-        """By `backend.supply`. Raises: UnfitError."""
         key, pump = f"backend.supply.pump{number}_ml_s", f"Pump{number}"
         if pump not in backend.supply.pumps:
             remedy = f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
@@ -88,7 +85,6 @@ class ChiBioFamily(Family):
             raise UnfitError(f"{key}: {pump} gives at most {can:.2f} mL a dose: {remedy}")
 
     def doses(self, backend: ChiBioConfig, bench: Bench) -> None:
-        """Whether the period is the device's, and the vials hold the cultures. Raises: UnfitError."""
         if bench.period_s != CONTROL_S:
             where = f"allowed {CONTROL_S:g} with backend={backend.kind}, which measures so often"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {where}")
@@ -100,23 +96,18 @@ class ChiBioFamily(Family):
                 raise UnfitError(f"bench.volume_ml = {ml:g} mL of {name}: {allowed}")
 
     def rim_ml(self, volumes_ml: Array) -> float:
-        """Of the glass vial."""
         return VIAL_ML
 
     def sees_fluorescence(self, backend: ChiBioConfig) -> bool:
-        """Whether its slot is on."""
         return backend.fluorescence.measure
 
     def seeing_fluorescence(self, backend: ChiBioConfig) -> ChiBioConfig:
-        """With its slot on."""
         return replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
 
     def address(self, backend: ChiBioConfig) -> str:
-        """Of the device's server."""
         return backend.url
 
     def unmeasured(self, backend: ChiBioConfig) -> str:
-        """Pumps without a calibration. Raises: UnfitError."""
         found = load_calibrations(Path(backend.calibration), backend.reactors)
         nominal = [name for name, c in zip(backend.reactors, found, strict=True) if not c.calibrated]
         return f"pumps not weighed, taken as 1 mL/s: {', '.join(nominal)}" if nominal else ""

@@ -40,7 +40,6 @@ class FluorescenceSlotConfig:
 
     @property
     def command(self) -> str:
-        """The one POST that toggles the slot; "" if nothing is to be measured."""
         settings = (self.slot, self.led, self.base_band, self.band, "OFF", self.gain)
         return f"/SetFPMeasurement/{'/'.join(settings)}" if self.measure else ""
 
@@ -78,10 +77,7 @@ class Fluorescence:
         self._switched_in = -1  # the cycle in which it was last toggled, which may have been after its measurement
 
     def keep_on(self, state: DeviceState) -> DeviceState:
-        """Have the slot on with its settings; the reactor's state then. What cannot be had becomes `trouble`.
-
-        Args: state: just read. Raises: as `Connection.toggle` and `Connection.read`.
-        """
+        """Have the slot on as configured; return the state then. What cannot be had is `trouble`. Raises: as `read`."""
         found = still = self._config.wrong(state)
         if found not in ("", HIDDEN):
             self._switched_in = state.cycles

@@ -41,7 +41,6 @@ class OverflowPumpConfig:
         return tuple(p for p in PUMPS if p != self.pump)
 
     def others_on(self, state: DeviceState) -> str:
-        """Names of the other pumps that are on."""
         return ", ".join(p for p in state.running_pumps if p in self.others)
 
     @property
@@ -73,10 +72,7 @@ class OverflowPump:
         self._connection, self._config, self._book = connection, config, book
 
     def keep_on(self, state: DeviceState) -> DeviceState:
-        """Have it on with its duty; the reactor's state then. What cannot be had becomes `trouble`.
-
-        Args: state: just read. Raises: as `Connection.post` and `Connection.read`.
-        """
+        """Have it on with its duty; return the state then. What cannot be had is `trouble`. Raises: ReactorError."""
         config, connection = self._config, self._connection
         if not (found := config.wrong(state)):
             self.trouble, self.was_on = None, self.was_on or bool(config.pump)

@@ -96,10 +96,7 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
 
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration], room_ml: float) -> Check:
-    """Check what the overflow pump covers; without one, what cannot be prevented.
-
-    Args: room_ml: above the fullest culture.
-    """
+    """Check what the overflow pump covers; room_ml is above the fullest culture."""
     overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
     if not overflow.pump:
         return Check(
@@ -121,7 +118,6 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration],
 
 
 def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig) -> Check:
-    """Whether the slot measures light, if it is on already; a run switches it on."""
     what = f"{name} fluorescence"
     slot, found = config.own(state), config.wrong(state)
     if slot is None:
@@ -139,7 +135,6 @@ def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig)
 
 
 def _reactor(name: str, state: DeviceState, calibration: ReactorCalibration, config: ChiBioConfig) -> Iterator[Check]:
-    """Check one reactor's state."""
     blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
     source = "stored" if math.isfinite(calibration.blank) else "of the device"
     yield Check(

@@ -18,9 +18,8 @@ LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus
 
 
 def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
-    """Give `doses` single-shot doses of 63 s * `duty`, one per step; yields how many have been given.
+    """Give `doses` single doses of 63 s * `duty`, one per step, verified off after each; yield how many.
 
-    The pump is verified off after every dose and when the generator is closed.
     Raises: DeviceStateError if an experiment runs or a dose did not begin; LinkError, ProtocolError.
     """
     state = connection.read()
@@ -66,7 +65,6 @@ def warm_up(
 
 
 def _sound(reactors: ChiBioReactors) -> Measurement:
-    """Return the newest samples of reactors without a fault. Raises: DeviceStateError naming the faults."""
     m = reactors.measure()
     assert m.vitals is not None
     faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]
@@ -76,13 +74,11 @@ def _sound(reactors: ChiBioReactors) -> Measurement:
 
 
 def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array]:
-    """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
+    """Average the raw counts of `samples` cycles of clear medium, set them as blanks; return mean and sd, shape (N,).
 
-    Returns their mean and standard deviation, shape (N,).
-
-    Needs clear medium in stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own
-    measurement, stirrer still, so they hold under run conditions (docs/device.md, Blank).
-    Raises: SensorError if a count is impossible or they scatter by more than 2 %; ReactorError.
+    Needs stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own measurement, so
+    they hold under run conditions (docs/device.md, Blank).
+    Raises: SensorError for counts that cannot be or scatter by more than 2 %; ReactorError.
     """
     rows: list[list[float]] = [[] for _ in reactors.names]
     while min(map(len, rows)) < samples:

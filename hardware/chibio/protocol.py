@@ -117,20 +117,15 @@ class DeviceState:
 
     @property
     def running_pumps(self) -> tuple[str, ...]:
-        """Names of the pumps that are on."""
         return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
 
     @property
     def pumping_modes(self) -> tuple[str, ...]:
-        """Modes that are on and switch pumps on their own."""
         return tuple(m for m in self.modes if m in PUMPING_MODES)
 
     @property
     def ended(self) -> bool:
-        """Whether the newest line of the log says that the experiment's last thread has ended.
-
-        "Experiment Stopped", or "Experiment on M0 (IDENTITY) Stopped" of newer apps; "Stopping" is not yet.
-        """
+        """Whether the log says last that all ended: "Experiment Stopped", newer "Experiment on M0 (ID) Stopped"."""
         return re.search(r"\bExperiment\b.*\bStopped\b", self.terminal) is not None
 
     @property
@@ -177,10 +172,7 @@ def _text(data: Any, *keys: str) -> str:
 
 
 def _newest(data: Any) -> tuple[float, ...]:
-    """Last entries of the three records, nan where their lengths differ: the device was just replacing its lists.
-
-    The serial agent sends the lengths apart because it cuts the lists.
-    """
+    """Last entries of the three records, nan while the device replaces its lists; an agent sends lengths apart."""
     lists = {name: _get(data, name, "record") for name in ("time", "OD", "ThermometerIR")}
     if not all(isinstance(x, list) for x in lists.values()):
         raise NotUnderstood(what="a record is not a list")
@@ -209,10 +201,7 @@ def _slot(data: Any, name: str) -> Slot:
 
 
 def parse_state(body: bytes) -> DeviceState:
-    """Parse the answer to GET /getSysdata/; unknown fields are ignored, NaN is accepted in readings.
-
-    Raises: ProtocolError naming the first field that is missing or malformed.
-    """
+    """Parse the answer to GET /getSysdata/; unknown fields are ignored, NaN is a reading. Raises: ProtocolError."""
     try:
         data = json.loads(body)
     except (ValueError, RecursionError) as error:

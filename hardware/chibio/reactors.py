@@ -17,7 +17,7 @@ from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.dose_sequence import REFUSALS, Context
+from hardware.chibio.dose_sequence import REFUSALS
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay
@@ -52,18 +52,18 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
     ) -> None:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         super().__init__(clock, config.stale_s, log)
-        self.config, self._bench = config, bench or Bench()
+        self.config, bench = config, bench or Bench()
         self._link = SharedLink(transport, clock)
         self._past = dict.fromkeys(config.reactors, ReactorHistory())
         self._agenda = Agenda(clock)
-        self.stations = tuple(self._station(*one) for one in zip(config.reactors, calibrations, strict=True))
-
-    def _station(self, name: str, calibration: ReactorCalibration) -> ChibioStation:
-        connection = Connection(name, self.config.permitted, self._link, self._clock, self.note_down)
-        book = Logbook(name, self.note_down, self.write, self.elapsed)
-        past = partial(self._past.__getitem__, name)
-        volume_ml = self._bench.volume_of(name)
-        return ChibioStation(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
+        self.stations = tuple(
+            ChibioStation(
+                Connection(name, config.permitted, self._link, clock, self.note_down), bench.volume_of(name),
+                calibration, config, self._agenda, Logbook(name, self.note_down, self.write, self.elapsed),
+                partial(self._past.__getitem__, name),
+            )
+            for name, calibration in zip(config.reactors, calibrations, strict=True)
+        )  # fmt: skip
 
     def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
         """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
@@ -87,9 +87,8 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
     def _take_over(self, histories: Mapping[str, ReactorHistory]) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
 
-        An overflow pump is verified on before the first dose. An experiment that already runs is adopted, never started
-        again (a second start would stop it); its next new sample is the first one delivered. So is a reactor that was
-        handed over to the on-board regulation: it stays so.
+        An experiment that already runs is adopted, never started again (a second start would stop it), and a reactor
+        that was handed over to the on-board regulation stays so.
         """
         self._past |= histories
         failed = list[ReactorError]()
@@ -132,7 +131,6 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
                 self.note_down("task_failed", {"error": str(error)})
 
     def _wait(self, longest_s: float) -> None:
-        """Until the next look or the next task."""
         self._clock.sleep(max(min(longest_s, self._agenda.next_due() - self._clock.now()), 0.01))
 
     def stop(self) -> None:
@@ -182,7 +180,6 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         super().note_down(kind, self._remember(kind, fields))
 
     def _remember(self, kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Remember what a row says, as a resumed run would; return the row."""
         row = {"time_s": round(self.elapsed(), 3), **fields}
         if (name := str(row.get("reactor"))) in self._past:
             self._past[name] = self._past[name].after({"kind": kind, **row})

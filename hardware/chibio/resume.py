@@ -4,13 +4,13 @@ A life of the program enters each row as it writes it; a resumed one begins with
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
 from hardware.storage.doses import feeds_by
-from hardware.storage.history import History, replayed
+from hardware.storage.history import History
 
 __all__ = ["NEVER", "ReactorHistory", "Span", "replay"]
 
@@ -25,12 +25,11 @@ class ReactorHistory(History):
     """What a run must remember of one reactor.
 
     overflow_pump_on: it was verified on. start_time: of the device's experiment; a sample's key is (record time,
-      cycles).
-    Of an open dose: feed_s, waste_s are its on-times as planned; feed_pump, which pump feeds; experiment, start_time
-      then. feed_on, waste_on, feed_off, waste_off: run times between which that pump went on or off, by the answer to
-      its command or by what was found; nan if not known. feed_tried, waste_tried: run time at which it was first asked
-      off without an answer. feed_anew, waste_anew: run time since which it may have been switched on anew by somebody
-      else, and the on-time then; nan if nothing speaks for that.
+    cycles). Of an open dose: feed_s, waste_s are its on-times as planned; feed_pump, which pump feeds; experiment,
+    start_time then. feed_on, waste_on, feed_off, waste_off: run times between which that pump went on or off, by the
+    answer to its command or by what was found; nan if not known. feed_tried, waste_tried: run time at which it was
+    first asked off in vain. feed_anew, waste_anew: run time since which somebody else may have switched it on anew, and
+    the on-time then, or nan.
     """
 
     device_id: str = ""
@@ -54,7 +53,6 @@ class ReactorHistory(History):
     KEYS: ClassVar = {**History.KEYS, "device_id": str, "blank": float, "start_time": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """Return what is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
         kind, known = row["kind"], super().after(row)
         if kind == "intent":
             feed_s, waste_s = (PERIOD_S * float(row[f"{part}_duty"]) for part in ("feed", "waste"))
@@ -67,7 +65,7 @@ class ReactorHistory(History):
                 str(row["path"]), row["answer"], float(row["time_s"]), float(row.get("took_s") or 0.0)
             )
         if kind == "found":
-            said = {key: _span(row[key]) for key in SPANS & row.keys()}
+            said = {k: NEVER if (at := row[k]) is None else (float(at[0]), float(at[1])) for k in SPANS & row.keys()}
             seen_s = float(row.get("time_s", math.nan))  # still on, although it was asked off: it goes off after that
             over = {
                 f"{key[:-4]}_tried": seen_s if at is NEVER else math.nan for key, at in said.items() if "off" in key
@@ -90,11 +88,4 @@ class ReactorHistory(History):
         return known
 
 
-def _span(said: Any) -> Span:
-    """Two run times; None: not known."""
-    return NEVER if said is None else (float(said[0]), float(said[1]))
-
-
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
-    """Replay the journal of a run for each reactor. Args: rows: oldest first. Raises: RecordingError."""
-    return replayed(rows, ReactorHistory())
+replay = ReactorHistory.replay

@@ -8,6 +8,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.messages import SampleBeforeLate, SampleLate
 from hardware.chibio.protocol import DeviceState
 from hardware.clock import Clock
+from hardware.stations import Newest
 
 __all__ = ["FIRST_SAMPLE_S", "Sampling"]
 
@@ -15,23 +16,21 @@ CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 
 
-class Sampling:
+class Sampling(Newest):
     """The newest sample of one reactor.
 
-    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. A
-    sample that was waited for appeared when it was seen. The smallest offset between the two clocks among such samples
-    shows how late any other one was seen.
+    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. The
+    smallest offset between the two clocks among samples that were waited for shows how late any other one was seen.
 
-    Attributes: key, (record time, cycles) of the newest sample, None before the first; od, temperature, raw, blank,
-      fluorescence of it, and at, when it was seen, nan before the first; arrived_s, the clock time from which its age
-      counts; late_s, how long after it appeared it was seen; next_poll, the clock time of the next look.
+    Attributes: key, (record time, cycles) of the newest sample, None before the first; late_s, how long after it
+      appeared it was seen.
     """
 
     def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
-        self._config, self._clock = config, clock
+        super().__init__(clock.now())
+        self._config, self._clock, self.next_look, self.blank = config, clock, clock.now(), math.nan
+        self.fluorescence = math.nan if config.fluorescence.measure else None
         self.key: tuple[float, int] | None = None
-        self.od = self.temperature = self.raw = self.blank = self.fluorescence = self.at = math.nan
-        self.arrived_s = self.next_poll = clock.now()
         self.late_s = 0.0
         self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
         self._looked = False  # the last look found nothing new, so the next sample will be seen when it appears
@@ -56,7 +55,7 @@ class Sampling:
 
         `cycles` counts cycles begun: a sample that was seen late may carry the number of the next one already.
         """
-        self.next_poll = now + self._config.poll_s
+        self.next_look = now + self._config.poll_s
         return math.isfinite(state.sample_s) and (
             self.key is None or (state.sample_s != self.key[0] and state.cycles >= self.key[1])
         )
@@ -66,16 +65,13 @@ class Sampling:
         self._looked = not is_new
 
     def take(self, state: DeviceState, now: float) -> Message | None:
-        """Make a new sample the newest one; returns what it shows of the board's clock, None if nothing.
-
-        Args: now: clock time at which it was seen.
-        """
+        """Make a new sample, seen at `now`, the newest one; return what it shows of the board's clock, or None."""
         self.key = (state.sample_s, state.cycles)
         self.arrived_s = self.at = now
         self.od, self.temperature = state.sample_od, state.sample_temperature
         self.raw, self.blank = state.raw, state.blank
         note = self._measure_lateness(now - state.sample_s)
-        self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
+        self.next_look = now + CYCLE_S - (2.5 if self._looked else 20.0)
         self._looked = False
         return note
 

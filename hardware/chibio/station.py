@@ -9,16 +9,20 @@ from typing import Any
 
 from conf.messages import Message
 from hardware.chibio import messages
-from hardware.chibio.agenda import Task
+from hardware.chibio.agenda import Agenda, Task
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import describe, diagnose, fault_of, regulates
-from hardware.chibio.dose_sequence import Context, DoseSequence
-from hardware.chibio.dosing import DosePlan
+from hardware.chibio.dose_sequence import DoseSequence
+from hardware.chibio.dosing import DosePlan, ReactorCalibration
 from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, PUMPS, DeviceState
+from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import FIRST_SAMPLE_S, Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.stations import Newest
+from hardware.logbook import Logbook
+from hardware.stations import Station
 
 __all__ = ["ChibioStation"]
 
@@ -29,21 +33,22 @@ STARTS = 3  # attempts to start an experiment before it counts as failed
 AGAIN_S = 60.0  # from a restart that failed to the next one
 
 
-class ChibioStation:
+class ChibioStation(Station):
     """One reactor under control.
 
-    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; regulated_od, OD at which it was handed over to
-      the on-board regulation, nan while this program controls; busy, while the reactor is being started or recovered;
-      restored, whether it goes on from what an earlier life left.
+    Args: volume_ml: of its culture; else as of `DoseSequence`.
+    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; busy, while the reactor is being started or
+      recovered; restored, whether it goes on from what an earlier life left.
     """
 
-    def __init__(self, context: Context) -> None:
-        self.connection, self.book = connection, book = context.connection, context.book
-        self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
-        self._volume_ml, self._past, self._clock = context.volume_ml, context.past, connection.clock
-        self.sampling = Sampling(self._config, self._clock)
-        self.doses = DoseSequence(context)
-        self.regulated_od = math.nan
+    def __init__(
+        self, connection: Connection, volume_ml: float, calibration: ReactorCalibration, config: ChiBioConfig,
+        agenda: Agenda, book: Logbook, past: Callable[[], ReactorHistory],
+    ) -> None:  # fmt: skip
+        self.connection, self.book, self.name, self._clock = connection, book, connection.name, connection.clock
+        self._volume_ml, self._calibration, self._config, self._agenda = volume_ml, calibration, config, agenda
+        self._past, self.sampling = past, Sampling(config, connection.clock)
+        self.doses = DoseSequence(connection, calibration, config, agenda, book, past)
         self.overflow_pump = OverflowPump(connection, self._config.overflow_pump, book)
         self.fluorescence = Fluorescence(connection, self._config.fluorescence, book)
         self.busy = self.restored = False
@@ -54,34 +59,9 @@ class ChibioStation:
         self._heat = True
         self._blank = math.nan
 
-    @property
-    def name(self) -> str:
-        """Position, M0 to M7."""
-        return self.connection.name
-
-    @property
-    def newest(self) -> Newest:
-        """Its newest sample."""
-        s = self.sampling
-        light = s.fluorescence if self._config.fluorescence.measure else None
-        return Newest(s.at, s.od, s.temperature, s.raw, s.arrived_s, s.blank, light)
-
-    @property
-    def next_look(self) -> float:
-        """Clock time of the next look."""
-        return self.sampling.next_poll
-
-    @property
-    def handed_over(self) -> bool:
-        """Whether the on-board regulation has it."""
-        return math.isfinite(self.regulated_od)
-
-    # ------------------------------------------------------------------------------------------- start and recovery
-
     def restore(self) -> None:
-        """Take over identity and memory of an earlier life; all pumps but the overflow pump are verified off then.
+        """Take over from an earlier life; pumps are verified off, unless the reactor regulates itself as left.
 
-        A reactor that regulates itself as it was handed over is not interrupted.
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
         history = self._past()
@@ -101,10 +81,7 @@ class ChibioStation:
         self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
-        """Task: an experiment that runs with the right blank and targets; a running one is adopted, not restarted.
-
-        Args: waited: an old cycle thread is known to have ended. Raises (from its steps): ReactorError.
-        """
+        """Task: have the experiment run as it should; adopt one that runs. Args: waited: no old cycle is left."""
         try:
             yield from self._let_measure()
             state = self.connection.read()
@@ -128,7 +105,7 @@ class ChibioStation:
             if self.handed_over:
                 self._hand_over_again()
             state = self._keep_on(self.connection.read())
-            self.sampling.arrived_s = self.sampling.next_poll = self._clock.now()
+            self.sampling.arrived_s = self.sampling.next_look = self._clock.now()
             self.book.log(
                 "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
                 start_time=state.start_time,
@@ -196,10 +173,7 @@ class ChibioStation:
             raise messages.DoesNotStart(reactor=self.name)
 
     def _recover(self, kind: str) -> Task:
-        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead.
-
-        What does not succeed is said, and tried again when the fault is seen the next time.
-        """
+        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead; else said."""
         self._restarts += 1
         if self._restarts > 1:
             self.book.tell(messages.RestartedAgain(attempt=self._restarts))
@@ -221,11 +195,9 @@ class ChibioStation:
             self.busy = False
             self.sampling.arrived_s = self._clock.now()  # a further recovery waits its time
 
-    # ------------------------------------------------------------------------------------------------- measurement
-
     def poll(self) -> bool:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
-        self.sampling.next_poll = self._clock.now() + self._config.retry_s
+        self.sampling.next_look = self._clock.now() + self._config.retry_s
         try:
             if not self.restored:
                 if not self.busy:
@@ -241,11 +213,9 @@ class ChibioStation:
         return False if self.busy else self._judge(state)
 
     def _keep_on(self, state: DeviceState) -> DeviceState:
-        """Overflow pump and fluorescence slot as this run has them; the reactor's state then."""
         return self.fluorescence.keep_on(self.overflow_pump.keep_on(state))
 
     def _judge(self, state: DeviceState) -> bool:
-        """Judge a verified state; return True if it brings a new sample."""
         now = self._clock.now()
         self.doses.watch(state, ours=not self.handed_over)
         self._unspoil(state)
@@ -288,12 +258,12 @@ class ChibioStation:
         return (self.doses.stuck or "its pumps could not be verified off") if self.doses.escalated else self._ended
 
     def _take(self, state: DeviceState, now: float) -> None:
-        """Deliver a new sample, write it down, and put heater and stirrer right."""
         sampling, self._restarts = self.sampling, 0
         if note := sampling.take(state, now):
             self.book.tell(note)
-        sampling.fluorescence = self.fluorescence.reading(state)
-        light = {"fluorescence": sampling.fluorescence} if self._config.fluorescence.measure else {}
+        if self._config.fluorescence.measure:
+            sampling.fluorescence = self.fluorescence.reading(state)
+        light = {} if sampling.fluorescence is None else {"fluorescence": sampling.fluorescence}
         self.book.log(
             "sample", sample=sampling.key, od=sampling.od, temperature=sampling.temperature, raw=sampling.raw,
             blank=state.blank, late_s=sampling.late_s, read_s=self.connection.took_s, **light,
@@ -330,13 +300,8 @@ class ChibioStation:
         except ReactorError as error:
             self.book.tell(messages.NotPutRight(item=item, found=found, done=done, error=error))
 
-    # --------------------------------------------------------------------------------------------------- actuation
-
     def dose(self, rate: float, number: int) -> DosePlan:
-        """Begin the dose for the newest sample (`DoseSequence.begin`), unless the reactor may not be dosed now.
-
-        Args: rate: mL/s. number: of the pump that feeds.
-        """
+        """Begin the dose, mL/s by pump `number`, for the newest sample, unless the reactor may not be dosed now."""
         refusal: Message | None = self.book.fault
         pump = f"Pump{number}"
         if self.handed_over:
@@ -362,10 +327,7 @@ class ChibioStation:
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError.
-
-        Written down before it is done: a run that is killed in between hands over when it is resumed.
-        """
+        """Hand over to the on-board regulation, at most 0.02 of full power; first written down. Raises: as `post`."""
         connection = self.connection
         connection.pumps_off(pumps=self._config.overflow_pump.others)
         self.book.log("regulate", setpoint=setpoint)
@@ -377,7 +339,6 @@ class ChibioStation:
         self.regulated_od = setpoint
 
     def _hand_over_again(self) -> None:
-        """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
         state, done = self.connection.read(), "left to it"
         if not regulates(state, self.regulated_od):
             self.regulate(self.regulated_od)
@@ -385,7 +346,6 @@ class ChibioStation:
         self.book.tell(messages.StaysHandedOver(setpoint=self.regulated_od, done=done))
 
     def _take_control(self) -> None:
-        """Switch the on-board regulation off, which was found on. Raises: ReactorError."""
         self.connection.switch("OD", False)
         if not self.handed_over:
             self.book.tell(messages.RegulationFoundOn())

@@ -7,13 +7,14 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Due", "EventQueue", "LinkFaults", "ProcessDied", "Steps"]
+from hardware.emulator.faults import Switches
+
+__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Due", "EventQueue", "ProcessDied", "Steps"]
 
 Steps = Generator[float, None, None]
 
@@ -52,7 +53,6 @@ class EventQueue:
         self._order = 0
 
     def add(self, delay: float, steps: Steps, life: int, owner: str) -> None:
-        """Have `steps` continue after `delay` s."""
         self._order += 1
         heapq.heappush(self._events, Due(self.now + delay, self._order, steps, life, owner))
 
@@ -75,55 +75,19 @@ class EventQueue:
         heapq.heapify(self._events)
 
 
-@dataclass
-class LinkFaults:
-    """Fault switches of network, server and board, as in `faults.FAULTS`.
-
-    Counters go down with every use, -1 = until set to 0. The last four are variants seen in forks and newer apps
-    (docs/device.md, Variants).
-    """
-
-    slow_s: float = 0.0
-    hang_s: float = 0.0
-    lost_request: int = 0
-    lost_reply: int = 0
-    reset_before: int = 0
-    reset_after: int = 0
-    malformed: int = 0
-    truncated: int = 0
-    lying: int = 0
-    bus_stuck: bool = False
-    bus_stuck_when_pumping: bool = False
-    disk_full: bool = False
-    foreign_selects: float = 0.0
-    require_requested_with: bool = False
-    terminal_as_list: bool = False
-    terminal_named: bool = False
-    extra_fields: bool = False
-
-    def take(self, name: str) -> bool:
-        """Is this counted fault due? Counts it down."""
-        left: int = getattr(self, name)
-        if left > 0:
-            setattr(self, name, left - 1)
-        return left != 0
-
-
 class Computer:
-    """Clocks, threads and bus.
+    """Clocks, threads and bus. Args: now: device time at the start, s; unit: which of several devices.
 
-    Args: now: device time at the start, s; rng: how busy it happens to be; unit: which of several devices.
     `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
     """
 
     def __init__(self, now: float, rng: np.random.Generator, unit: int = 0) -> None:
         self.unit = unit
-        self.events, self.faults, self.rng = EventQueue(now), LinkFaults(), rng
+        self.events, self.faults, self.rng = EventQueue(now), Switches("board"), rng
         self.wall_offset_s = 0.0
         self.errors: deque[str] = deque(maxlen=200)
 
     def now(self) -> float:
-        """Device time of the event in progress, s."""
         return self.events.now
 
     def wall(self) -> float:
@@ -134,12 +98,7 @@ class Computer:
         """Format the board's clock as in the web page."""
         return datetime.fromtimestamp(self.wall(), UTC).strftime("%Y-%m-%d %H:%M:%S")
 
-    def uniform(self, low: float, high: float) -> float:
-        """Draw a random number from the computer's own stream."""
-        return float(self.rng.uniform(low, high))
-
     def bus(self, name: str) -> None:
-        """One bus access. Raises: BusStuck."""
         if self.faults.bus_stuck:
             raise BusStuck(name)
 

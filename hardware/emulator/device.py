@@ -29,10 +29,10 @@ __all__ = ["ChiBioDevice", "DeviceOptions", "plant_preset"]
 
 @functools.cache
 def plant_preset(name: str) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows.
+    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows. Raises: ValueError.
 
-    The vial's optics (`VialConfig`) stand for noise, misreadings and counts of the preset's sensor, which are left out:
-    a vial takes only the sensor's noise-free value. Raises: ValueError naming the presets.
+    `VialConfig` stands for noise, misreadings and counts of its sensor: a vial takes only the sensor's noise-free
+    value.
     """
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     return replace(plant, pump=replace(plant.pump, dosing="pulse"))
@@ -40,8 +40,6 @@ def plant_preset(name: str) -> PlantConfig:
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the emulated device is built."""
-
     unit: int = setting(0, "number of the device; different devices have different identities", at_least=0)
     vial: VialConfig = part(VialConfig, "optics and electronics")
     plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
@@ -53,7 +51,6 @@ class DeviceOptions:
 
 
 def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
-    """One value per reactor. Raises: ValueError for another number of them."""
     values = [float(given)] * n if isinstance(given, (int, float)) else [float(x) for x in given]
     if len(values) != n:
         raise ValueError(f"{what} has {len(values)} values: allowed 1 or {n}, one per reactor")
@@ -63,14 +60,10 @@ def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
 class ChiBioDevice:
     """A Chi.Bio control computer with reactors.
 
-    Args:
-      reactors: positions with a reactor plugged in, e.g. ("M0", "M1").
-      clock: device seconds; `handle` sleeps on it.
-      rng: noise of everything, one stream per reactor.
-      options: see `DeviceOptions`.
-      od: initial optical density, one for all or one per reactor; temperature: of the vials, degC.
-      volumes_ml: culture up to the waste tube, one for all or one per reactor.
-      blanked: start with the zeros an operator has set with clear medium; False = 65000, as after power-on.
+    Args: reactors: positions with a reactor plugged in. clock: device seconds; `handle` sleeps on it. rng: of all
+      noise, a stream per reactor. od: initial density; volumes_ml: culture up to the waste tube; one for all or one per
+      reactor. temperature: of the vials, degC. blanked: start with the zeros of clear medium; False = 65000, as after
+      power-on.
     Raises: ValueError for an unknown or repeated position or a wrong number of ODs.
     """
 
@@ -106,10 +99,9 @@ class ChiBioDevice:
     @property
     def apps(self) -> dict[str, ReactorApp]:
         """What the software that runs, or ran last, holds of each position M0 to M7."""
-        return self.supervisor.worker.software.apps
+        return self.supervisor.software.apps
 
     def next_time(self) -> float:
-        """When the next event is due, device s; inf if none."""
         return self._events.next_time()
 
     def run_until(self, t: float) -> None:
@@ -132,7 +124,7 @@ class ChiBioDevice:
         except (AppError, ArithmeticError, LookupError, TypeError, ValueError) as problem:
             computer.note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends, silently as there
             return
-        deadline = self.supervisor.worker.deadline
+        deadline = self.supervisor.deadline
         if event.owner == REQUEST and events.now + pause > deadline:
             events.add(deadline - events.now, self._time_out(), event.life, event.owner)
         elif pause < math.inf:
@@ -141,7 +133,6 @@ class ChiBioDevice:
             self.faults.bus_stuck, self.faults.bus_stuck_when_pumping = True, False
 
     def _time_out(self) -> Steps:
-        """End a request that outlives the worker's time-out."""
         self.supervisor.kill_worker()
         yield from ()
 
@@ -161,7 +152,7 @@ class ChiBioDevice:
 
     def _arrive(self, exchange: Exchange) -> Steps:
         if self.supervisor.alive:
-            self.supervisor.worker.accept(exchange)
+            self.supervisor.accept(exchange)
         else:
             exchange.fate = "refused"
         yield from ()

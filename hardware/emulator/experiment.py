@@ -21,8 +21,6 @@ FEED_CAP = 0.02  # the on-board regulator's own limit
 
 
 class Experiment:
-    """The experiment of one reactor."""
-
     def __init__(self, position: Position, outputs: Outputs, optics: Optics) -> None:
         self._position, self._outputs, self._optics = position, outputs, optics
         self._started: float | None = None
@@ -55,7 +53,6 @@ class Experiment:
             yield from self._outputs.set_on(item, 0)
 
     def _finish(self) -> Steps:
-        """End of the last cycle."""
         yield from self._outputs.everything_off()
         self._position.terminal("Experiment Stopped")
 
@@ -86,7 +83,7 @@ class Experiment:
         rest = experiment["cycleTime"] - round(computer.wall() - began, 2)
         if rest < 0.0:
             self._position.terminal("Experiment Cycle Time is too short!!!")
-        yield max(rest, 0.0) + CYCLE_EXTRA_S + computer.uniform(0.0, 0.04)
+        yield max(rest, 0.0) + CYCLE_EXTRA_S + computer.rng.uniform(0.0, 0.04)
         yield from self._outputs.set_on(data["Light"]["Excite"], 0)
         self._position.terminal(f"Cycle {experiment['cycles']} Complete")
         if experiment["ON"] and experiment["threadCount"] == mine:
@@ -122,7 +119,6 @@ class Experiment:
         yield from self._outputs.set_on("Stir", 1)
 
     def _store(self, started: float) -> Steps:
-        """Store records, thin them, write files."""
         data, experiment = self._position.data, self._position.data["Experiment"]
         if experiment["cycles"] % 10 == 9:
             clear_terminal(data, self._position.computer.stamp())
@@ -161,10 +157,7 @@ class Experiment:
 
 
 def _feed_duty(data: SysData) -> float:
-    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up.
-
-    `data` is sysData with at least two records and a volume; OD.Integral and OD.Integral2 are updated.
-    """
+    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up."""
     od, times = data["OD"], data["time"]["record"]
     now, before = od["current"], od["record"][-1]
     target = od["target"] if od["target"] > 0 else 1e-6

@@ -23,7 +23,6 @@ EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that i
 
 
 def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
-    """Build the command line of the device's process."""
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}, **_told(backend)}
     arguments["volume"] = ",".join(f"{ml:g}" for ml in bench.volumes(backend.reactors))
     if (overflow := backend.overflow_pump).pump:
@@ -33,7 +32,6 @@ def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
 
 
 def _told(backend: EmulatorConfig) -> dict[str, str]:
-    """Return what its vials are told beside their preset."""
     return {key: getattr(backend, key, usual) for key, (usual, _, _) in TOLD.items()}
 
 
@@ -46,10 +44,7 @@ class EmulatorFamily(ChiBioFamily):
 
     @contextmanager
     def linked(self, backend: ChiBioConfig, bench: Bench) -> Iterator[Link]:
-        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock.
-
-        Raises: ReactorError.
-        """
+        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock."""
         assert isinstance(backend, EmulatorConfig)
         if not backend.speed:
             log.info("emulated device inside this program, in virtual time")
@@ -63,20 +58,16 @@ class EmulatorFamily(ChiBioFamily):
                 yield link
 
     def holding(self, backend: EmulatorConfig, preset: str, **values: Any) -> EmulatorConfig:
-        """See `Family.holding`."""
         plant = preset if backend.plant == EmulatorConfig().plant else backend.plant
         return replace(backend, plant=plant, **values)
 
     def vials(self, backend: EmulatorConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
-        """Of the preset `backend.plant`."""
         return "backend.plant", told(plant_preset(backend.plant), _told(backend))
 
     def address(self, backend: ChiBioConfig) -> str:
-        """In a process of this computer."""
         return "in this computer"
 
     def start_od(self, backend: EmulatorConfig, plant: PlantConfig) -> float:
-        """As configured."""
         return backend.od
 
 

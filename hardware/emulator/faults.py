@@ -1,14 +1,15 @@
 """Faults of the emulated device that can be switched while it runs, by name: in process or over HTTP."""
 
 from itertools import product
+from types import SimpleNamespace
+from typing import Any
 
-from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.sysdata import SLOTS
 
-__all__ = ["FAULTS", "inject"]
+__all__ = ["FAULTS", "Switches", "inject"]
 
 # name: (kind, allowed values, what it does)
-#   board: no reactor needed; vial: a field of VialFaults; plant: a switch of the plant; act: done once
+#   board: no reactor needed; vial: of a reactor; both are `Switches`; plant: a switch of the plant; act: done once
 FAULTS: dict[str, tuple[str, str, str]] = {
     "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
     "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
@@ -81,12 +82,29 @@ PLANT = {  # fault: part of the plant, its switch
     "fp_saturated": ("fluorescence", "saturated"),
 }
 SIGNED = {"clock_step", "od_offset", "od_jump"}
+TYPES = {"0 or 1": bool, "count": int}  # of a switch by its allowed values, else float
 
 
-def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float = 1.0) -> None:
-    """Switch fault `name` of `FAULTS` to `value`.
+class Switches(SimpleNamespace):
+    """Fault switches of a kind, "board" or "vial", each an attribute; may be set at any time.
 
-    Args: reactor: M0 to M7, or "all"; ignored by faults of the whole board.
+    Counters go down with every use, -1 = until set to 0. Forks and newer apps: docs/device.md, Variants.
+    """
+
+    def __init__(self, kind: str) -> None:
+        super().__init__(**{k: TYPES.get(allowed, float)() for k, (of, allowed, _) in FAULTS.items() if of == kind})
+
+    def take(self, name: str) -> bool:
+        """Is this counted fault due? Counts it down."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left != 0
+
+
+def inject(device: Any, name: str, reactor: str = "all", value: float = 1.0) -> None:
+    """Switch fault `name` of `FAULTS` of a `ChiBioDevice` to `value`, at a reactor, M0 to M7, or "all".
+
     Raises: ValueError for an unknown name, a position without reactor, or a value out of range.
     """
     if name not in FAULTS:
@@ -114,7 +132,7 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
                 getattr(owner, switch)[:] = value
 
 
-def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:
+def _act(device: Any, name: str, names: tuple[str, ...], value: float) -> None:
     s = device.supervisor
     of_board = {"worker_wipe": s.kill_worker, "crash": s.crash, "power_cut": s.cut_power, "restart": s.restart}
     if name in of_board:

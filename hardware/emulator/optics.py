@@ -17,8 +17,6 @@ BASE = 20000.0  # and where one does
 
 
 class Optics:
-    """Measurements of one reactor by light."""
-
     def __init__(self, position: Position, outputs: Outputs) -> None:
         self._position, self._outputs = position, outputs
 

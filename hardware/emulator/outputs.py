@@ -16,9 +16,8 @@ OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running mo
 class Position:
     """What outputs, optics and experiment of one reactor share; `data` is its sysData.
 
-    Args:
-      name: M0 to M7; computer: the board; vial: what hangs on the cable, None for an empty position;
-      device_id: what its IR thermometer answers as identity; selected: reactor shown on the web page.
+    Args: name: M0 to M7; vial: what hangs on the cable, None for an empty position; device_id: what its IR thermometer
+      answers as identity; selected: reactor shown on the web page.
     """
 
     def __init__(self, name: str, computer: Computer, vial: Vial | None, device_id: str, selected: str) -> None:
@@ -27,7 +26,6 @@ class Position:
 
     @property
     def answers(self) -> bool:
-        """Tell whether a reactor is connected to the cable."""
         return self.vial is not None and not self.vial.faults.unplugged
 
     def forget(self, selected: str) -> None:
@@ -36,11 +34,9 @@ class Position:
         self.terminal("System Initialised")
 
     def terminal(self, text: str) -> None:
-        """One line in the web page's log."""
         add_terminal(self.data, self.computer.stamp(), text)
 
     def spawn(self, steps: Steps, what: str) -> None:
-        """Start the reactor's thread `what`."""
         self.computer.spawn(steps, f"{self.name}/{what}")
 
     def hardware(self) -> Vial:
@@ -73,8 +69,6 @@ def store_target(output: SysData, value: float) -> None:
 
 
 class Outputs:
-    """The outputs of one reactor."""
-
     def __init__(self, position: Position) -> None:
         self._position = position
         self.forget()
@@ -98,10 +92,7 @@ class Outputs:
         yield from self._apply(item)
 
     def _apply(self, item: str) -> Steps:
-        """`SetOutput`: make the electronics do what `ON` and `target` say.
-
-        Raises: AppError for an item that drives nothing; its flag is set by then.
-        """
+        """`SetOutput`: the electronics do what `ON` and `target` say. Raises: AppError for what drives nothing."""
         output, now = self._position.data[item], self._position.computer.now()
         if item == "Stir":
             yield from self._stir()
@@ -184,7 +175,7 @@ class Outputs:
         pump, computer = self._position.data[item], self._position.computer
         mine = self._pump_threads[item] = (self._pump_threads[item] + 1) % 100
         config = self._position.vial.config if self._position.vial is not None else VialConfig()
-        delay = computer.uniform(config.pump_start_low_s, config.pump_start_high_s)
+        delay = computer.rng.uniform(config.pump_start_low_s, config.pump_start_high_s)
         yield OFF_SHARE * delay
         if abs(pump["target"] * pump["ON"]) != 1 and mine == self._pump_threads[item]:
             self._position.hardware().drive(item, 0, computer.now())
@@ -200,7 +191,7 @@ class Outputs:
         vial = self._position.hardware()
         if mine == self._pump_threads[item] and pump["target"] != 0:
             vial.drive(item, 1 if pump["target"] > 0 else -1, computer.now())
-        yield on_s + computer.uniform(vial.config.on_time_bias_low_s, vial.config.on_time_bias_high_s)
+        yield on_s + computer.rng.uniform(vial.config.on_time_bias_low_s, vial.config.on_time_bias_high_s)
         if abs(pump["target"]) != 1 and mine == self._pump_threads[item]:
             self._position.hardware().drive(item, 0, computer.now())
         pause = period - round(computer.wall() - began, 2)

@@ -15,11 +15,8 @@ START_S = 60.0
 
 
 class EmulatorProcess(AbstractContextManager["EmulatorProcess"]):
-    """Starts the emulator and ends it again; use as a context manager. If this process is killed, it ends as well.
+    """An emulator of one's own, with url and control of its faults, as a context manager; it ends with this process.
 
-    Args:
-      arguments: of `python -m hardware.emulator`, without --port.
-    Attributes: url of the device, control of its fault switches.
     Raises: LinkError with the emulator's own words if it does not start.
     """
 
@@ -42,7 +39,6 @@ class EmulatorProcess(AbstractContextManager["EmulatorProcess"]):
         self.url, self.control = ready[1], ready[2]
 
     def close(self) -> None:
-        """End it. Idempotent."""
         self._process.terminate()
         try:
             self._process.wait(5.0)

@@ -37,7 +37,6 @@ class Exchange:
 
     @property
     def done(self) -> bool:
-        """Tell whether the request was answered or given up."""
         return self.answer is not None or self.fate != ""
 
 

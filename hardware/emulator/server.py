@@ -42,11 +42,7 @@ CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request
 
 
 class EmulatorServer:
-    """Serves `device` on two ports until `stop`.
-
-    Args: device: on a DeviceClock; host; port, control_port: 0 picks a free one.
-    Raises: OSError if a port cannot be had.
-    """
+    """Serves `device` on two ports until `stop`; port 0 picks a free one. Raises: OSError if one cannot be had."""
 
     def __init__(self, device: ChiBioDevice, host: str, port: int, control_port: int) -> None:
         self.device, self.lock = device, threading.Lock()
@@ -66,7 +62,6 @@ class EmulatorServer:
         self._stop.set()
 
     def run(self) -> None:
-        """Serve; returns after `stop`."""
         control = threading.Thread(target=self._control.serve_forever, args=(POLL_S,), daemon=True)
         control.start()
         try:
@@ -92,7 +87,6 @@ class EmulatorServer:
             self._stop.wait(POLL_S)
 
     def advance(self) -> None:
-        """Run what is due on the device."""
         with self.lock:
             self.device.run_until(self.device.clock.now())
 
@@ -121,7 +115,7 @@ class EmulatorServer:
                 if method == "GET" and parts == ["truth"]:
                     s = device.supervisor
                     software = {"alive": s.alive, "restarts": s.restarts, "exits": s.exits}
-                    seen = {"selected": s.worker.software.selected, "errors": list(device.computer.errors)}
+                    seen = {"selected": s.software.selected, "errors": list(device.computer.errors)}
                     return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
                 kept = method == "GET" and parts[0] in ("doses", "samples", "reads")
                 if kept and parts[1:] in [[m] for m in device.vials]:
@@ -139,10 +133,7 @@ def _json(value: object) -> bytes:
 
 
 class _DevicePort(HTTPServer):
-    """The device's port.
-
-    `fates` says how connections without an answer end: "reset", or "lost" = stays open and silent (kept in `held`).
-    """
+    """The device's port; fates: how connections end unanswered, "reset", or "lost": silent, in `held`."""
 
     timeout = POLL_S
     allow_reuse_address = True
@@ -216,7 +207,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of the program."""
     program = "python -m hardware.emulator"
     usage = f"{program} [--reactors M0,M1] [--speed 60] ...; {program} --help says all"
     p = argparse.ArgumentParser(prog=program, usage=usage, description="Emulated Chi.Bio behind HTTP.")
@@ -253,7 +243,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _numbers(what: str, given: str) -> float | list[float]:
-    """One number, or one per reactor. Raises: ValueError."""
     try:
         numbers = [float(x) for x in given.split(",")]
     except ValueError:

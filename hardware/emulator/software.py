@@ -36,10 +36,7 @@ class ReactorApp(Position):
 
 
 class Software:
-    """Memory of one process, with every position as after `initialise()`.
-
-    Args: computer: it runs on; vials: by position, those that hang on a cable.
-    """
+    """Memory of one process, with every position as after `initialise()`; vials, by position, hang on a cable."""
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
         self.computer, self.selected = computer, "M0"
@@ -54,7 +51,6 @@ class Software:
         return self.apps[self.selected if name == "0" else name]
 
     def select(self, name: str) -> None:
-        """Select a reactor for everybody."""
         self.selected = name
         for app in self.apps.values():
             app.data["UIDevice"] = name

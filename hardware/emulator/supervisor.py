@@ -8,7 +8,7 @@ from hardware.emulator.routes import HTML, Exchange, answer_request
 from hardware.emulator.software import Software
 from hardware.emulator.vial import Vial
 
-__all__ = ["REQUEST", "Supervisor", "WebWorker"]
+__all__ = ["REQUEST", "Supervisor"]
 
 REQUEST = "request"  # owner of the events of the request being served
 ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>Internal Server Error</h1>\n"
@@ -18,52 +18,47 @@ WORKER_TIMEOUT_S = 30.0  # gunicorn kills a worker whose request takes longer
 POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software stopped
 
 
-class WebWorker:
-    """The worker and the requests that wait for it.
+class Supervisor:
+    """Keeps one process of the software running, or none, and the requests that wait for it.
 
-    `software` is what it runs, `ready` whether it serves, `deadline` when the request being served has taken too long.
+    Args: vials: whose power it switches.
+    `software` is what its worker runs, or ran last; `deadline`, when the request being served has taken too long;
+    `alive`, whether anybody listens; `restarts` and `exits` count.
     """
 
-    def __init__(self, software: Software) -> None:
-        self.software, self.ready, self.deadline = software, True, 0.0
+    def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
+        self._computer, self._vials = computer, vials
+        self.alive, self.deadline, self.restarts, self.exits = True, 0.0, 0, 0
         self._waiting: deque[Exchange] = deque()
         self._serving: Exchange | None = None
+        self._start()
 
-    def boot(self, software: Software) -> None:
-        """Serve again, with other software."""
-        self.software, self.ready = software, True
+    def _start(self) -> None:
+        """Import of the app: every position initialised, power on, all outputs off; then its worker serves."""
+        self._computer.faults.bus_stuck = False
+        for vial in self._vials.values():
+            vial.set_power(True, self._computer.now())
+        self.software, self._ready = Software(self._computer, self._vials), True
         self._serve_next()
 
-    def end(self) -> None:
-        """Serve no more; the request being served breaks off."""
-        self.ready = False
-        if self._serving is not None:
-            self._serving.fate, self._serving = "reset", None
-
-    def turn_away(self) -> None:
-        """Nobody will serve those that wait."""
-        while self._waiting:
-            self._waiting.popleft().fate = "reset"
-
     def accept(self, exchange: Exchange) -> None:
-        """Accept a request that has arrived."""
+        """Take a request that has arrived."""
         self._waiting.append(exchange)
         self._serve_next()
 
     def _serve_next(self) -> None:
-        if self.ready and self._serving is None and self._waiting:
+        if self._ready and self._serving is None and self._waiting:
             self._serving = self._waiting.popleft()
-            computer = self.software.computer
-            self.deadline = computer.now() + WORKER_TIMEOUT_S
-            computer.spawn(self._serve(self._serving), REQUEST)
+            self.deadline = self._computer.now() + WORKER_TIMEOUT_S
+            self._computer.spawn(self._serve(self._serving), REQUEST)
 
     def _serve(self, exchange: Exchange) -> Steps:
-        computer, faults = self.software.computer, self.software.computer.faults
+        computer, faults, software = self._computer, self._computer.faults, self.software
         hang, faults.hang_s = faults.hang_s, 0.0
         yield REQUEST_S + hang
-        self.software.foreign_select()
+        software.foreign_select()
         try:
-            answer = yield from answer_request(self.software, exchange)
+            answer = yield from answer_request(software, exchange)
         except (AppError, ArithmeticError, LookupError, TypeError, ValueError) as problem:
             computer.note(f"{exchange.method} {exchange.path}: {type(problem).__name__}: {problem}")
             answer = (500, ERROR_PAGE, HTML)
@@ -74,40 +69,21 @@ class WebWorker:
         else:
             exchange.answer = answer
             if exchange.shows:
-                self.software.shown(exchange.shows)
+                software.shown(exchange.shows)
         self._serving = None
         self._serve_next()
 
-
-class Supervisor:
-    """Keeps one process of the software running, or none.
-
-    Args: vials: whose power it switches.
-    `alive` is whether anybody listens; `restarts` and `exits` count.
-    """
-
-    def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
-        self._computer, self._vials = computer, vials
-        self.alive = True
-        self.restarts = self.exits = 0
-        self.worker = WebWorker(self._started())
-
-    def _started(self) -> Software:
-        """Import of the app: every position initialised, power on, all outputs off."""
-        self._computer.faults.bus_stuck = False
-        for vial in self._vials.values():
-            vial.set_power(True, self._computer.now())
-        return Software(self._computer, self._vials)
-
     def _end_process(self) -> None:
-        """Threads and memory are gone; the latch cuts the power a second later."""
+        """Threads and memory are gone, and the request being served breaks off; the latch cuts the power soon."""
         events = self._computer.events
         events.life += 1
-        self.worker.end()
+        self._ready = False
+        if self._serving is not None:
+            self._serving.fate, self._serving = "reset", None
         events.add(POWER_LATCH_S, self._latch(events.life), HARDWARE, "latch")
 
     def _latch(self, life: int) -> Steps:
-        if life == self._computer.events.life and not self.worker.ready:
+        if life == self._computer.events.life and not self._ready:
             self._power_off()
         yield from ()
 
@@ -128,7 +104,7 @@ class Supervisor:
 
     def _boot(self, life: int) -> Steps:
         if life == self._computer.events.life and self.alive:
-            self.worker.boot(self._started())
+            self._start()
         yield from ()
 
     def exit(self) -> None:
@@ -136,7 +112,8 @@ class Supervisor:
         self._end_process()
         self.alive = False
         self.exits += 1
-        self.worker.turn_away()
+        while self._waiting:
+            self._waiting.popleft().fate = "reset"
 
     def crash(self) -> None:
         """Fault: the software ends itself, as after too many bus failures."""

@@ -105,7 +105,6 @@ def add_terminal(data: SysData, stamp: str, text: str) -> None:
 
 
 def clear_terminal(data: SysData, stamp: str) -> None:
-    """Empty the text log."""
     data["Terminal"]["text"] = ""
     add_terminal(data, stamp, "Terminal Cleared")
 
@@ -149,6 +148,5 @@ def thin_records(data: SysData) -> None:
 
 
 def _nearest(times: list[float], wanted: float) -> int:
-    """Index of the entry closest to `wanted` in an ascending list."""
     low = bisect_left(times, wanted, 0, len(times) - 1)
     return low - 1 if low > 0 and wanted - times[low - 1] < times[low] - wanted else low

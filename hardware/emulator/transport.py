@@ -14,9 +14,7 @@ class EmulatorTransport(Transport):
     """A link whose other end is `device`; time passes on the device's clock. Nothing to disarm, nothing to close.
 
     Like a client on a network it gives up after `timeout_s` while the server carries on with what it began, and every
-    later request waits its turn behind that.
-
-    Args: timeout_s: how long to wait for an answer, s, > 0. Raises: ValueError for a time-out not positive.
+    later request waits its turn behind that. Raises: ValueError for a time-out not positive.
     """
 
     def __init__(self, device: ChiBioDevice, timeout_s: float = 20.0) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 from conf.schema import check, require, setting
 from envs.plant.plant import Plant
 from envs.plant.sensor import density
+from hardware.emulator.faults import Switches
 
-__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Spectrometer", "StoredSample", "Vial", "VialConfig", "VialFaults"]
+__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Spectrometer", "StoredSample", "Vial", "VialConfig"]
 
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
@@ -89,39 +90,16 @@ class VialConfig:
             require(low <= getattr(self, key), f"vial.{key}", getattr(self, key), f"{low:g} to {high:g}")
 
 
-@dataclass
-class VialFaults:
-    """What is broken at one reactor, as in `faults.FAULTS`; may be set at any time."""
-
-    unplugged: bool = False
-    od_frozen: bool = False
-    od_offset: float = 0.0
-    od_jump: float = 0.0
-    spectrometer_dead: bool = False
-    spectrometer_dark: bool = False
-    spectrometer_glitch: float = 0.0
-    feed_stuck_open: bool = False
-    waste_stuck_open: bool = False
-    heater_runaway: bool = False
-    stirrer_dead: bool = False
-    internal_zero: int = 0
-
-
 class Spectrometer:
-    """One laser and the chip that counts its light.
+    """One laser and the chip that counts its light; `blank` is the count of clear medium. Args: rng: its noise."""
 
-    Args: config: optics; faults: what is broken, may change at any time; rng: noise of this reactor.
-    `blank` is the count of clear medium.
-    """
-
-    def __init__(self, config: VialConfig, faults: VialFaults, rng: np.random.Generator) -> None:
+    def __init__(self, config: VialConfig, faults: Switches, rng: np.random.Generator) -> None:
         self._config, self._faults, self._rng = config, faults, rng
         self.blank = float(rng.uniform(config.blank_low, config.blank_high))
         self._lit, self._lit_before, self._laser_since = 0.0, 0.0, np.nan
         self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
 
     def set_laser(self, on: bool, at: float) -> None:
-        """Laser on or off."""
         if not np.isnan(self._laser_since):
             self._lit += at - self._laser_since
         self._laser_since = at if on else np.nan
@@ -131,17 +109,13 @@ class Spectrometer:
         self._lit_before = self._lit_s(at)
 
     def _lit_s(self, at: float) -> float:
-        """Total time the laser has been on."""
         return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
 
     def counts(self, at: float, exposure_s: float, od: float, moving: bool) -> int:
-        """One spectrometer reading of the laser, 16-bit counts.
+        """One spectrometer reading of the laser, 16-bit counts, at device second `at`.
 
-        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
-        readings are lower.
-        Args:
-          at: device s; exposure_s: how long it should have been lit since `begin_exposure`.
-          od: what a noise-free sensor would show, OD; moving: whether the vial's content is in motion.
+        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred (moving) or
+        half-lit readings are lower: it should have been lit for exposure_s since `begin_exposure`.
         """
         f, c, rng = self._faults, self._config, self._rng
         if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
@@ -166,16 +140,14 @@ class Spectrometer:
 
 
 class Vial:
-    """One reactor as the chips see it.
+    """One reactor, a plant of one vial, as the chips see it.
 
-    Args:
-      plant: a plant of one vial; config: optics and electronics; rng: noise of this reactor; start: device s.
     `doses` holds what the motors did, `samples` what the software recorded, `reads` when a client was sent the newest
     sample (device s), all also over restarts; `on_s` the motors' total on-time, `peak_ml` the highest volume.
     """
 
     def __init__(self, plant: Plant, config: VialConfig, rng: np.random.Generator, start: float = 0.0) -> None:
-        self.plant, self.config, self.faults = plant, config, VialFaults()
+        self.plant, self.config, self.faults = plant, config, Switches("vial")
         self._rng, self._at = rng, start
         self.spectrometer = Spectrometer(config, self.faults, rng)
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
@@ -243,7 +215,6 @@ class Vial:
                 self._since[pump] = (at, media)
 
     def _delivered(self, pump: str) -> float:
-        """Fluid that a pump has brought in so far, mL."""
         return float(self.plant.feed.delivered_ml[0]) if pump == FEED else self.supplied_ml.get(pump, 0.0)
 
     def _supply(self, seconds: float) -> float:
@@ -254,20 +225,17 @@ class Vial:
         return sum(fluid.values())
 
     def set_heat(self, duty: float, at: float) -> None:
-        """Heater power, 0 to 1."""
         if duty != self.heat:
             self.sync(at)
             self.heat = duty
 
     def set_stirrer(self, power: float, at: float) -> None:
-        """Stirrer power, 0 to 1."""
         if self.stir > 0.0 and power == 0.0:
             self._settled_at = at + STIR_SETTLE_S
             self._stirred_at = at
         self.stir = power if self.powered and not self.faults.stirrer_dead else 0.0
 
     def sync(self, at: float) -> None:
-        """Bring the plant up to device time `at`."""
         while at - self._at > 1e-9:
             self._step(min(at - self._at, LONGEST_STEP_S))
 
@@ -304,7 +272,6 @@ class Vial:
         return round((AIR_C + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
 
     def counts(self, at: float, exposure_s: float) -> int:
-        """One spectrometer reading, as `Spectrometer.counts`."""
         self._nearly_sync(at)
         moving = self.stir > 0.0 or at < self._settled_at
         return self.spectrometer.counts(at, exposure_s, float(self.plant.apparent_od[0]), moving)

@@ -12,22 +12,10 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from conf.schema import require
 from hardware.clock import DeviceClock
 from hardware.errors import ReactorError
-from hardware.link import messages
-from hardware.link.transport import (
-    MAX_BODY,
-    WEB_ADDRESS,
-    Reply,
-    SwitchedOff,
-    Transport,
-    TransportConfig,
-    new_session,
-    read_secret,
-    switched_off,
-    web_address,
-)  # fmt: skip
+from hardware.link import messages, transport
+from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session
 
 __all__ = ["HttpTransport", "fetch"]
 
@@ -92,8 +80,7 @@ def fetch(
 ) -> tuple[int, bytes, httpx.Headers]:
     """Status, body and headers of an answer that came whole within `wait_s`, so that nobody who dribbles holds a loop.
 
-    Raises: LinkError, whose cause is an `httpx.ConnectError` or `ConnectTimeout` where nobody was reached;
-      ProtocolError for what is no HTTP answer, or longer than MAX_BODY.
+    Raises: LinkError, whose cause is an httpx.ConnectError or ConnectTimeout where nobody was reached; ProtocolError.
     """
     what, deadline, found = f"{method} {urlsplit(url).path}", time.monotonic() + wait_s, bytearray()
     try:
@@ -126,10 +113,7 @@ class HttpTransport(Transport):
 
     Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
     answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
-
-    Args:
-      url: http://host:port of the device; speed: device seconds per real second (1 on the bench).
-      session: 1 to 65535, by which a board agent knows this client from a second one.
+    Args: speed: device seconds per real second. session: by which a board agent knows this client from a second one.
     Raises: ValueError for a malformed address; LinkError for a token's file; LinkError, ProtocolError from the calls.
     """
 
@@ -137,11 +121,11 @@ class HttpTransport(Transport):
         self, url: str, speed: float = 1.0, config: TransportConfig | None = None, session: int | None = None
     ) -> None:
         config = config or TransportConfig()
-        require(web_address(url), "url", repr(url), WEB_ADDRESS)
+        transport.require_web_address("url", url)
         self.url = url.rstrip("/")
         self._clock = DeviceClock(speed)
         self._read_s = config.timeout(config.read_s, self._clock)
-        self._token = read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
+        self._token = transport.read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
             timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, self._clock)),
@@ -152,17 +136,14 @@ class HttpTransport(Transport):
         )
 
     def disarm(self) -> None:
-        """BYE to the agent, if there is one; its switch then rests until the next request."""
         if self._token:
             with contextlib.suppress(ReactorError):
                 self.post("/_agent/bye")
 
     def switched_off(self) -> SwitchedOff:
-        """Ask the agent, if there is one, what it has switched off. Raises: LinkError, ProtocolError."""
-        return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
+        return transport.switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 
     def close(self) -> None:
-        """Close the client. Idempotent."""
         self._client.close()
 
     def _request(self, method: str, path: str) -> Reply:

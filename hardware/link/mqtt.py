@@ -16,12 +16,10 @@ __all__ = ["MqttLink"]
 class MqttLink:
     """One client of a broker.
 
-    Args:
-      host, port, username, password: of the broker. name: of this client.
-      tls: encrypted; ca_file: certificate of who signed the broker's, "": those of this computer.
-      topics: filters that are subscribed to. take: called with topic, payload and whether it was retained, on the
-        connection's thread; what it raises is lost. again: called before anything arrives on a new connection.
-      will: topic of ours whose retained message the broker clears when we are gone.
+    Args: name: of this client. ca_file: certificate of who signed the broker's, "": those of this computer. topics:
+      filters that are subscribed to. take: called with topic, payload and whether it was retained, on the connection's
+      thread; what it raises is lost. again: called before anything arrives on a new connection. will: topic of ours
+      whose retained message the broker clears when we are gone.
     Attributes: broke_s, when the connection was last lost, by `clock`; lost, why, in words; refusal, why the broker
       does not let us in, "" if it did or was not reached.
     Raises: LinkError if the library or a certificate is missing, or the broker is not there.

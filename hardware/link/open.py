@@ -21,9 +21,7 @@ class DeviceLock:
     """A device's name in the kernel: one for all users of this computer, free when it is closed or the process ends.
 
     A file keeps the session under which this user is known to a board agent: who takes over from a client that was
-    killed goes on under its name and is in charge at once.
-
-    Args: device: its address, or what else names it: one device may have several names, each is locked.
+    killed goes on under its name and is in charge at once. One device may have several names, each is locked.
     Raises: DeviceStateError if another process holds it.
     """
 
@@ -47,7 +45,6 @@ class DeviceLock:
             kept.write_text(str(self.session))
 
     def close(self) -> None:
-        """Free it. Idempotent."""
         self._held.close()
 
 
@@ -55,8 +52,7 @@ class DeviceLock:
 def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Iterator[Transport]:
     """Open the configured link, owned exclusively on this computer as long as it is open.
 
-    Raises: ValueError for a malformed address, LinkError if a serial line cannot be opened, its agent does not answer
-      or the token of an agent cannot be read, DeviceStateError if another process holds the device.
+    Raises: ValueError for a malformed address, LinkError, DeviceStateError if another process holds the device.
     """
     serial = config.kind == "serial"
     with closing(DeviceLock(config.port if serial else url.rstrip("/"))) as lock:

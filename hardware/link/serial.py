@@ -39,12 +39,10 @@ class ReplyHeader:
     crc: int
 
     def fits(self, body: bytes) -> bool:
-        """Whether this header and `body` came undamaged."""
         return zlib.crc32(b"<%d %d %d" % (self.number, self.status, self.length) + body) == self.crc
 
 
 def encode_request(number: int, method: str, path: str) -> bytes:
-    """Encode a request line with its newline."""
     head = f">{number} {method} {path}".encode("ascii")
     return head + b" %08x\n" % zlib.crc32(head)
 
@@ -56,7 +54,6 @@ def decode_header(line: bytes) -> ReplyHeader | None:
 
 
 def _text(reply: Reply) -> str:
-    """Word the agent's report of a request that the device did not answer."""
     return reply.body[:300].decode("ascii", "replace")
 
 
@@ -65,12 +62,8 @@ class SerialTransport(Transport):
 
     The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
     memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
-    The state comes reduced (see `board_agent.py`).
-
-    Args:
-      port: serial device or pyserial URL; speed: device seconds per real second.
-      attempts: times one request line is sent before the link counts as lost.
-      session: 1 to 65535, by which the agent knows this client from a second one; the upper half of every ID.
+    Args: port: serial device or pyserial URL. attempts: times one request line is sent before the link counts as lost.
+      session: by which the agent knows this client from a second one; the upper half of every ID.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 
@@ -91,13 +84,11 @@ class SerialTransport(Transport):
         self._open()
 
     def disarm(self) -> None:
-        """BYE to the agent, whose switch then rests until the next request."""
         if self._line is not None:
             with contextlib.suppress(LinkError, ProtocolError):
                 self._exchange("BYE", "/")
 
     def switched_off(self) -> SwitchedOff:
-        """Ask the agent what it has switched off. Raises: LinkError, ProtocolError."""
         return switched_off(self._exchange("PING", "/").body, self._clock)
 
     def _open(self) -> None:
@@ -208,7 +199,6 @@ class SerialTransport(Transport):
         return bytes(line)
 
     def _read(self, count: int, deadline: float) -> bytes | None:
-        """Exactly `count` bytes, or None at the deadline."""
         assert self._line is not None
         data = bytearray()
         while len(data) < count:

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-from conf.schema import check, setting
+from conf.schema import check, require, setting
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError
 from hardware.link import messages
 
 __all__ = [
-    "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
-    "read_secret", "switched_off", "web_address",
+    "MAX_BODY", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
+    "read_secret", "require_web_address", "switched_off",
 ]  # fmt: skip
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
@@ -30,17 +30,14 @@ MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
 
 
-WEB_ADDRESS = "http://host:port, for instance http://192.168.7.2:5000"
-
-
-def web_address(url: str) -> bool:
-    """Whether a server can be reached under it: `WEB_ADDRESS`, with https too, without a path."""
+def require_web_address(key: str, url: str) -> None:
+    """Raise ValueError, naming the config's key, for what is no http or https address of a host without a path."""
     try:
         parts = urlsplit(url)
-        _ = parts.port
+        _, good = parts.port, parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
     except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
+        good = False
+    require(good, key, repr(url), "http://host:port, for instance http://192.168.7.2:5000")
 
 
 def new_session() -> int:
@@ -68,14 +65,10 @@ class Transport(Protocol):
         """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
         return self._request("POST", path)
 
-    def _request(self, method: str, path: str) -> Reply:
-        """One request over this link, GET or POST. Raises: as `get` and `post`."""
+    def _request(self, method: str, path: str) -> Reply: ...
 
     def disarm(self) -> None:
-        """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.
-
-        The next request arms it again. Raises: nothing; an armed switch is the safe side.
-        """
+        """Tell a dead-man switch that all pumps are verified off; the next request arms it again. Raises: nothing."""
         return
 
     def switched_off(self) -> SwitchedOff:
@@ -93,10 +86,7 @@ class SharedLink(Transport):
     After a request that took longer than `SILENT_S` and brought no answer, every request within the next `PAUSE_S`
     fails at once. So a silent server costs all reactors together one time-out, and they are told of it within that.
     Where others are answered between two time-outs of one reactor, requests about that one alone fail at once, for
-    `REST_S`: it must not take its neighbours' time.
-
-    Args: link: carries the requests. clock: device time.
-    Attributes: heard_s, clock time of the newest answer, -inf before the first.
+    `REST_S`: it must not take its neighbours' time. heard_s is the clock time of the newest answer.
     """
 
     SILENT_S, PAUSE_S, REST_S = 1.0, 2.0, 40.0
@@ -135,10 +125,7 @@ class SharedLink(Transport):
 
 
 def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff:
-    """Read from the status of a board agent what it has switched off.
-
-    Args: clock: of the device. Raises: ProtocolError for a status that is not an agent's.
-    """
+    """Read from an agent's status what it has switched off, by the device's clock. Raises: ProtocolError."""
     try:
         found = json.loads(status)["switched_off"]
         return {m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()}
@@ -176,10 +163,7 @@ class TransportConfig:
 
 
 def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r"[!-~]") -> str:
-    """One line of `least` to 256 characters, for the config value `key`.
-
-    Raises: LinkError naming the file and the remedy; never the secret.
-    """
+    """One line of `least` to 256 characters, for the config value `key`. Raises: LinkError, never with the secret."""
     file = Path(path).expanduser()
     try:
         mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()

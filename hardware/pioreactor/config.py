@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from conf.schema import check, part, require, setting
 from hardware.clock import DeviceClock
-from hardware.link.transport import WEB_ADDRESS, read_secret, web_address
+from hardware.link.transport import read_secret, require_web_address
 
 __all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
 
@@ -33,7 +33,7 @@ class UnitConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend.units.NAME")
-        require(not self.address or web_address(self.address), "backend.units.NAME.address", self.address, WEB_ADDRESS)
+        require_web_address("backend.units.NAME.address", self.address or "http://NAME.local")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class PioreactorConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend")
-        require(not self.leader or web_address(self.leader), "backend.leader", self.leader, WEB_ADDRESS)
+        require_web_address("backend.leader", self.leader or "http://BROKER")
         host = bool(self.broker) and not set(self.broker) & set(" /")
         require(host, "backend.broker", repr(self.broker), "the name of a host; its port is broker_port")
         unique = len(set(self.reactors)) == len(self.reactors)
@@ -94,7 +94,6 @@ class PioreactorConfig:
         return replace(self, **{key: getattr(own, key) for key in keys})
 
     def address(self, unit: str) -> str:
-        """Of a unit's web server."""
         return (self.units.get(unit, UnitConfig()).address or f"http://{unit}.local").rstrip("/")
 
     def password(self) -> str:

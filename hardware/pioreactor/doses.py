@@ -5,7 +5,7 @@ on record with the least and the most, and what was booked otherwise when it beg
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -18,8 +18,8 @@ from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, DOSING_JOBS, MEDIA, NAMES, NUMBERS, PUMPS, SPARE, WASTE, Event
 from hardware.pioreactor.pumps import LATE_ML, OURS, SETTLE_S, STEP_S, Moved, Pumps, Request
 from hardware.stations import Plan
-from hardware.storage import history as history_of
 from hardware.storage.doses import Ending, Given, feeds_by
+from hardware.storage.history import History
 
 __all__ = ["Doses", "UnitHistory", "replay"]
 
@@ -28,7 +28,7 @@ DRAINS = 5  # attempts to empty a vial after that
 
 
 @dataclass(frozen=True)
-class UnitHistory(history_of.History):
+class UnitHistory(History):
     """One unit's past; boot, when it had been started; of an open dose pump, id and task, the answer to its request."""
 
     boot: str = ""
@@ -36,11 +36,10 @@ class UnitHistory(history_of.History):
     id: str = ""
     task: str = ""
 
-    KINDS: ClassVar = (*history_of.History.KINDS, "task")
-    KEYS: ClassVar = {**history_of.History.KEYS, "boot": str}
+    KINDS: ClassVar = (*History.KINDS, "task")
+    KEYS: ClassVar = {**History.KEYS, "boot": str}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """Return what is known after one more row of this unit. Raises: as a row that is damaged makes it."""
         known = super().after(row)
         if row["kind"] == "intent":
             return replace(known, pump=int(feeds_by(row)[-1]), id=str(row["id"]), task="")
@@ -49,9 +48,7 @@ class UnitHistory(history_of.History):
         return known
 
 
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, UnitHistory]:
-    """Replay the journal of a run for each unit. Args: rows: oldest first. Raises: RecordingError."""
-    return history_of.replayed(rows, UnitHistory())
+replay = UnitHistory.replay
 
 
 class Doses:
@@ -129,7 +126,6 @@ class Doses:
         return messages.DosedElsewhere() if self.pumps.box.on() or self.pumps.box.live(*DOSING_JOBS) else None
 
     def work(self) -> None:
-        """Do what is due; called again and again."""
         if self._course is None:
             self._settle_pins()
             if job := next((job for job in self.pumps.jobs if self.pumps.odd(job)), ""):
@@ -154,13 +150,11 @@ class Doses:
         if self._course is None:
             self._settle_strange()
 
-    # -- the course of a dose --------------------------------------------------------------------------------------
-
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
-        """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
-        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not (WASTE in self.pumps.barred or self._ran_on):
+        most_ml = max(plan.waste_ml, plan.feed_ml + LATE_ML)  # of a job that ended late: its waste takes that, too
+        if 0.0 < media.high <= most_ml and not (WASTE in self.pumps.barred or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
 
@@ -186,7 +180,6 @@ class Doses:
         self._conclude(plan, dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> None:
-        """Conclude a dose: record its end, then correct what was booked since it began."""
         for job, moved, ml in ((self._job, media, media.high), (WASTE, waste, waste.low)):
             self.pumps.counted[job, dose] = ml
             if moved.end:
@@ -247,8 +240,6 @@ class Doses:
             more_ml, self._taken_ml = before_ml + taken_ml - self._taken_ml, before_ml + taken_ml
             high_ml, low_ml = self._now_ml[:2] - self._base_ml
             self._fed(high_ml, low_ml, more_ml)
-
-    # -- what nobody commanded -------------------------------------------------------------------------------------
 
     def _silence(self, job: str, name: str) -> Iterator[float]:
         """End a pump that runs without a job, or whose job was killed, and record what it moved."""

@@ -49,7 +49,6 @@ class PioreactorFamily(Family):
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:
-        """As the family says, and a new run is checked first. Raises: ReactorError."""
         earlier, began = opening.earlier(), opening.began
         with ExitStack() as stack:
             with not_looked_at(opening.resumed):
@@ -64,22 +63,18 @@ class PioreactorFamily(Family):
                 yield reactors
 
     def preflight(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> list[Check]:
-        """As `hardware.pioreactor.preflight`. Raises: ReactorError."""
         with self.units(backend, bench, folder) as reactors:
             return preflight(reactors)
 
     def tube(self, backend: PioreactorConfig, number: int, most_ml: float, who: str) -> None:
-        """By `backend.alt_media`. Raises: UnfitError."""
         if not backend.alt_media:
             remedy = "give it one, calibrate it in the vendor's page and set backend.alt_media=true"
             raise UnfitError(f"{who}: pump {number}, the vendor's alt-media pump, has no tube; {remedy}")
 
     def no_thermostat(self, backend: PioreactorConfig) -> str | None:
-        """Name the setting that leaves the vendor's thermostat off; None where the thermostat is on."""
         return None if backend.thermostat else " without backend.thermostat=true"
 
     def doses(self, backend: PioreactorConfig, bench: Bench) -> None:
-        """Whether period, volumes and the largest dose are such as a unit may have. Raises: UnfitError."""
         where = f"backend={backend.kind}"
         if not 30.0 <= bench.period_s <= 600.0:
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: allowed 30 to 600 with {where}")
@@ -97,11 +92,9 @@ class PioreactorFamily(Family):
             )
 
     def rim_ml(self, volumes_ml: Array) -> Array:
-        """Return the vendor's limit of each vial."""
         return np.array([FULL_ML[vial_ml(ml)] for ml in volumes_ml])
 
     def address(self, backend: PioreactorConfig) -> str:
-        """Of the cluster's broker."""
         return f"{backend.broker}:{backend.broker_port}"
 
 

@@ -221,7 +221,6 @@ class Mailbox:
         return found
 
     def state(self, job: str) -> State:
-        """Return what a job of our experiment last said."""
         return self.states.get((self._experiment, job), State())
 
     def live(self, *jobs: str) -> bool:
@@ -231,7 +230,6 @@ class Mailbox:
         return any(s.word in LIVE and (mine or s.at > -math.inf) for s, mine in known)
 
     def on(self) -> list[str]:
-        """Jobs whose pumps run by what the unit said last."""
         return [job for job, pin in self.pins.items() if pin.on]
 
 

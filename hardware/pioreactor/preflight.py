@@ -36,7 +36,6 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
 
 
 def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[Check]:
-    """Check one unit. Raises: ReactorError where it does not answer."""
     unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))

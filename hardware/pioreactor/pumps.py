@@ -71,7 +71,6 @@ class Unit:
 
     @property
     def real(self) -> Clock:
-        """Real time: messages, jobs, pins."""
         return self.clock.real
 
     def say(self, topic: str, payload: str) -> None:
@@ -138,12 +137,7 @@ class Pumps:
         return (pin.on and settled and not self.box.live(job, *AUTOMATIONS)) or (state.word == "lost" and new)
 
     def rebooted(self, rows: list[dict[str, Any]]) -> bool:
-        """Whether the unit was started again, by its list of running jobs."""
         return boot_of(rows) not in ("", self.boot)
-
-    def named(self, job: str) -> str:
-        """Name a pump, and the pin behind it."""
-        return f"the {NAMES[job]} pump (pin {self.box.jobs[job]})"
 
     def told_on(self, job: str) -> bool:
         """Whether the unit tells that a pump is on, since the broker is there, and not because of a short run."""
@@ -156,7 +150,6 @@ class Pumps:
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
 
     def said(self, request: Request) -> float:
-        """Sum what the events of a run reported so far, mL."""
         return self.reported[request.job, request.dose]
 
     def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
@@ -195,7 +188,6 @@ class Pumps:
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
-        """Follow a job to its end; return what it gave."""
         job = request.job
         if why := (yield from self._begins(request)):
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
@@ -213,10 +205,7 @@ class Pumps:
         return self._moved(request)
 
     def _beyond(self, request: Request) -> float:
-        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard.
-
-        A unit that lost its power says nothing; one that has it is asked.
-        """
+        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard."""
         pin, flow, now = self.pins[request.job], self.flow_ml_s[request.job], self.clock.now()
         on_s = max(pin.on_s, request.asked_s)
         end_s = on_s + request.ml / flow
@@ -227,7 +216,6 @@ class Pumps:
         return (now - on_s) * flow if self.box.heard_s > end_s else 0.0
 
     def broke(self, request: Request) -> bool:
-        """Whether the connection to the broker was lost since a run was asked for."""
         return self.mqtt.broke_s >= request.asked_s
 
     def _begins(self, request: Request) -> Steps[Message | None]:
@@ -341,7 +329,6 @@ PROOFS: tuple[dict[str, tuple[Any, ...]], ...] = (
 
 
 def is_off(seen: Seen) -> bool:
-    """Whether that proves a pump off."""
     return any(all(getattr(seen, key) in values for key, values in row.items()) for row in PROOFS)
 
 
@@ -358,13 +345,12 @@ class ForcedEnd:
         self._from_s = max(request.asked_s, told_s if told_s < math.inf else -math.inf)
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
-        self._quiet_s = self._still_s = math.inf
+        self._quiet_s = self._still_s = self._left_s = math.inf
         self._apart_s = self.began
         self._short: Future[str] | None = None
         self._rebooted = self.lost = self._held = False
 
     def _shorts(self) -> float:
-        """Sum what short runs of the pump reported, mL."""
         return self._p.reported[self._job, self._p.short]
 
     def act(self) -> None:
@@ -389,7 +375,6 @@ class ForcedEnd:
             self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
     def _look(self) -> Seen:
-        """Return what is known now."""
         p, pin, state = self._p, self._p.pins[self._job], self._p.box.state(self._job)
         self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
@@ -399,7 +384,10 @@ class ForcedEnd:
         if told and not pin.on and not self._untold:
             self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
-            self._listed = any(row["job_name"] == self._job for row in rows[0])
+            first, self._listed = self._listed is None, any(row["job_name"] == self._job for row in rows[0])
+            begun = self._request.ml > 0.0 and (pin.on_s >= self._since or p.said(self._request) > 0.0)
+            if begun and first and not self._listed:  # a job leaves the list after its pin is off, a killed one stays
+                self._left_s = p.clock.now()
             self._rebooted = not self._listed and p.rebooted(rows[0])
             p.boot = boot_of(rows[0]) if self._rebooted else p.boot
         ended = self._shorts() > self._shorts_before and state.word == "disconnected"
@@ -436,14 +424,15 @@ class ForcedEnd:
         p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
-        flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
+        flowed = max(min(now, self._left_s) - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
         return flowed if not broke and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
         """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pins[self._job], self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
-        longest = min(max(min(off_s, self._still_s) - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
+        off_s = min(off_s, self._still_s, self._left_s)
+        longest = min(max(off_s - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
         if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
             ran = longest

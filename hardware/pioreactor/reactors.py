@@ -53,7 +53,6 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         )  # fmt: skip
 
     def _take_over(self, histories: Mapping[str, UnitHistory]) -> None:
-        """Versions and calibrations read, jobs adopted or started, open doses of an earlier life looked for."""
         self.connect()
         self.mqtt.hold()
         if others := [other for unit in self.names if (other := self.mqtt.holder(unit))]:
@@ -77,7 +76,6 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         self._real.sleep(1.0)
 
     def _wait(self, _longest_s: float) -> None:
-        """Until messages may have come."""
         self._real.sleep(LOOK_S)
 
     def _all(
@@ -109,7 +107,6 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         self.stations[n].level_ml = level_ml
 
     def close(self) -> None:
-        """Leave the broker and the units. Idempotent."""
         self.mqtt.close()
         self.leader.close()
         for station in self.stations:

@@ -7,6 +7,7 @@ import numpy as np
 
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Reading
+from hardware.stations import Newest
 
 __all__ = ["UnitSampling"]
 
@@ -15,23 +16,20 @@ DARK = 5.0  # counts, below which the interlock calls a light sensor failed
 COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt
 
 
-class UnitSampling:
+class UnitSampling(Newest):
     """Readings of one unit, and its newest sample.
 
-    Attributes: od, spread, of the sample: median of its readings and robust sd of that; raw, as the interlock's counts;
-      number, of readings; at, clock time of their middle; arrived_s, when it was made; count, of samples; read_s, clock
-      time of the newest reading.
+    Attributes: od, spread, of the sample: median of its readings and robust sd of that; number, of readings; at, clock
+      time of their middle; count, of samples; read_s, clock time of the newest reading.
     """
 
     def __init__(self, config: PioreactorConfig, period_s: float, now: float) -> None:
-        self._config, self._period_s = config, period_s
+        super().__init__(now)
+        self._config, self._period_s, self._due = config, period_s, -math.inf
         self._readings: deque[Reading] = deque(maxlen=1000)
-        self.at = self.od = self.spread = self.raw = math.nan
-        self.arrived_s, self.read_s, self.number, self.count = now, now, 0, 0
-        self._due = -math.inf
+        self.spread, self.read_s, self.number, self.count = math.nan, now, 0, 0
 
     def take(self, readings: list[Reading]) -> None:
-        """Take readings that arrived, at clock times."""
         self._readings.extend(readings)
         self.read_s = readings[-1].at if readings else self.read_s
 

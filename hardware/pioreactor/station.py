@@ -13,12 +13,12 @@ from hardware.errors import ReactorError
 from hardware.messages import Fault, UndosedFault
 from hardware.pioreactor import messages
 from hardware.pioreactor.doses import Doses, UnitHistory
-from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, PUMPS, WASTE
+from hardware.pioreactor.mailbox import ALT, AUTOMATIONS, MEDIA, NAMES, PUMPS, WASTE
 from hardware.pioreactor.pumps import STEP_S, UNSTARTED_S, Pumps, Unit, boot_of
 from hardware.pioreactor.sampling import UnitSampling
 from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts, regulates, request, target_of
 from hardware.pioreactor.web import Barrier, Calls
-from hardware.stations import Newest, Plan
+from hardware.stations import Plan, Station
 
 __all__ = ["PioreactorStation"]
 
@@ -30,14 +30,11 @@ PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
-class PioreactorStation:
+class PioreactorStation(Station):
     """One unit of a cluster.
 
-    Attributes: regulated_od, OD at which the vendor's turbidostat was started, nan if it was not; level_ml, that the
-      unit's own ledger is to be put to, nan if it is not; up, whether it was brought up; next_look, which is always.
+    Attributes: level_ml, that the unit's own ledger is to be put to, nan if it is not; up, whether it was brought up.
     """
-
-    next_look = -math.inf
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.name, self.book, self._web = unit, unit.name, unit.book, unit.web
@@ -47,7 +44,7 @@ class PioreactorStation:
         self.doses = Doses(self._pumps)
         self._answer = self._pumps.answer
         self.sampling = UnitSampling(unit.config, unit.bench.period_s, self._clock.now())
-        self.regulated_od = self._target = self.level_ml = math.nan
+        self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = self._listened = False
         self._calls, self._leads, self._astray = Calls(self._web, self._real), Calls(unit.leader, self._real), ""
         self._course: Iterator[float] | None = None
@@ -55,8 +52,6 @@ class PioreactorStation:
         self._asked_s: dict[str, float] = {}
         self._listed = set[str]()
         self._target_sent_s, self._target_sends = math.inf, 0
-
-    # -- bringing up -----------------------------------------------------------------------------------------------
 
     def bring_up(self, history: UnitHistory) -> Iterator[float]:
         """Version and calibrations read, jobs adopted or started, an open dose looked for. Raises: ReactorError."""
@@ -84,7 +79,7 @@ class PioreactorStation:
         self.book.log("device", device_id=self.name, url=url, flows=p.flow_ml_s, boot=p.boot, run=self.unit.run)
         self.book.log("temperature", temperature=self._target)
         yield from () if history.open else self.hear_pins()
-        self.up = True
+        self.up, self.sampling.arrived_s = True, self._clock.now()  # the first sample is waited for from now on
 
     def hear_pins(self) -> Iterator[float]:
         """Course: switch a pin, that of stirring, until the unit tells it, for at most a minute."""
@@ -114,13 +109,10 @@ class PioreactorStation:
             self.lie_down(error, history)
 
     def _start(self, job: str) -> Iterator[float]:
-        """Ask for one of the vendor's jobs. Raises: ReactorError."""
         options, overrides = request(job, self._config, self._pumps.facts, self._target, self.regulated_od)
         yield from self._answer(self._web.run, job, options, overrides)
         self._asked_s[job] = self._real.now()
         self.book.log("command", job=job, options=options)
-
-    # -- what happens ----------------------------------------------------------------------------------------------
 
     def go_on(self) -> None:
         """Take in what the unit said, and go on with a dose and what else is under way."""
@@ -168,25 +160,14 @@ class PioreactorStation:
         undisturbed_s = self._clock.of_real(self.doses.ended_s) + self._config.mix_s
         dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
         is_new, s = not dosing and self.sampling.look(self._clock.now(), undisturbed_s), self.sampling
+        s.temperature = c = self._box.temperature
         self.book.report(self._wrong())
         if is_new:
-            t, c = self.book.elapsed() - self._clock.now() + s.at, self._box.temperature
+            t = self.book.elapsed() - self._clock.now() + s.at
             self.book.log("sample", sample_s=round(t, 3), od=s.od, spread=s.spread, readings=s.number, temperature=c)
         return is_new
 
-    @property
-    def newest(self) -> Newest:
-        """Its newest sample."""
-        s = self.sampling
-        return Newest(s.at, s.od, self._box.temperature, s.raw, s.arrived_s)
-
-    @property
-    def handed_over(self) -> bool:
-        """Whether the vendor's turbidostat has it."""
-        return math.isfinite(self.regulated_od)
-
     def _wrong(self) -> Fault | None:
-        """Return what is wrong now."""
         if not self._mqtt.connected:
             return messages.NoBroker(broker=self._config.broker, why=self._mqtt.lost or "nothing comes")
         if found := self._pumps.trouble or self._mqtt.holder(self.name):
@@ -216,7 +197,6 @@ class PioreactorStation:
         return messages.DoseNotTaken(why=self.doses.refused[-1]) if self.doses.refused[1:] else None
 
     def _wanted(self) -> list[str]:
-        """List the jobs that this run keeps going."""
         heated = self._config.thermostat and not self.heat_is_off and math.isfinite(self._target)
         wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: self.handed_over}
         return [job for job, it_is in wanted.items() if it_is]
@@ -247,8 +227,6 @@ class PioreactorStation:
         with suppress(ReactorError):
             yield from self._answer(self._web.stop, job) if self._box.live(job) else self._start(job)
 
-    # -- commands --------------------------------------------------------------------------------------------------
-
     def dose(self, rate: float, pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
         fault = self.book.fault
@@ -267,7 +245,6 @@ class PioreactorStation:
         return plan
 
     def set_temperature(self, target: float) -> None:
-        """Thermostat to a target, degC; nan leaves it."""
         if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
             return
         self._target, self._target_sent_s, self._target_sends = target, -math.inf, 0
@@ -297,10 +274,10 @@ class PioreactorStation:
             ):  # fmt: skip
                 if self._real.now() > deadline or (pumps.trouble and not final):
                     heard = box.heard_s > self._real.now() - PUMPS_S
-                    on = [pumps.named(job) for job in PUMPS if heard and pumps.told_on(job)]
+                    on = [job for job in PUMPS if heard and pumps.told_on(job)]
                     why = (pumps.trouble or "look at the unit's log") if self._mqtt.connected else "no broker to ask"
                     if on:
-                        raise messages.UnitPumpOn(unit=self.name, pump=on[0], why=why)
+                        raise messages.UnitPumpOn(unit=self.name, pump=NAMES[on[0]], pin=box.jobs[on[0]], why=why)
                     off = "look at its pumps, pull the plug of one that runs" if final else "still being verified"
                     raise messages.UnitPumpsUnproven(unit=self.name, why=why, off=off)
                 self.go_on()

@@ -48,7 +48,6 @@ CHANGES: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def number(version: str) -> tuple[int, ...]:
-    """By which versions are older or newer."""
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
@@ -81,7 +80,6 @@ def request(job: str, config: PioreactorConfig, facts: Facts, temperature: float
 
 
 def regulates(settings: Any, asked: dict[str, Any]) -> bool:
-    """Whether the settings of the vendor's turbidostat are those that it was asked for with."""
     try:
         pairs = [(settings["settings"][key.replace("-", "_")], value) for key, value in asked.items()]
         return all(abs(float(a) - b) <= 1e-6 if isinstance(b, float) else a == b for a, b in pairs)

@@ -39,7 +39,6 @@ class Web:
         return self._pool.submit(what, *given)
 
     def get(self, path: str, below: str = "/unit_api") -> Any:
-        """Get the answer's content. Raises: LinkError, ProtocolError."""
         return self.send("GET", path, None, below)
 
     def run(self, job: str, options: Mapping[str, Any], overrides: Sequence[Sequence[str]] = ()) -> str:
@@ -140,7 +139,6 @@ class Calls:
         self.failed: dict[str, tuple[float, str]] = {}
 
     def due(self, kind: str, every_s: float) -> bool:
-        """Whether something of this kind is to be done now."""
         if due := self._clock.now() >= self._next.get(kind, -math.inf):
             self._next[kind] = self._clock.now() + every_s
         return due
@@ -166,7 +164,6 @@ class Barrier:
         self._clock, self._from_s, self._passed = clock, clock.now() + wait_s, False
 
     def passed(self) -> bool:
-        """Whether it was, by what was answered until now."""
         if self._clock.now() < self._from_s or self._passed:
             return self._passed
         said = self._calls.ask("result", 0.5, self._web.result, self._task) if self._task else None

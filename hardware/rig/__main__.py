@@ -13,7 +13,6 @@ from hardware.rig.processes import Rig
 
 
 def main() -> int:
-    """Start it, say where it is, wait."""
     program = "python -m hardware.rig"
     usage = f"{program} [--units NAME=ML,...] ...; {program} --help says all"
     parser = argparse.ArgumentParser(prog=program, usage=usage, description=__doc__)

@@ -31,15 +31,14 @@ def _runs(python: str) -> bool:
 
 
 def broker() -> str | None:
-    """Find the MQTT broker, None if there is none."""
     return shutil.which("mosquitto") or shutil.which("/usr/sbin/mosquitto")
 
 
 def home(package: str = PUBLISHED, folder: str = "") -> Path:
     """Where the environment of a package is, built or not; a wheel is known by its name and content.
 
-    Args: package: version on the package index, with or without "pioreactor==", or path of a wheel. folder: of all
-      environments, "" for the one in the user's cache.
+    Args: package: version on the package index, or path of a wheel. folder: of all environments, "" for the user's
+      cache.
     """
     wheel, key = Path(package).expanduser(), package.removeprefix("pioreactor==")
     if wheel.is_file():
@@ -48,7 +47,6 @@ def home(package: str = PUBLISHED, folder: str = "") -> Path:
 
 
 def version(env: Path) -> str:
-    """Of the vendor's package in a built environment."""
     return next(env.glob("lib/python*/site-packages/pioreactor-*.dist-info")).stem.split("-")[1]
 
 
@@ -74,10 +72,7 @@ def newer() -> str:
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:
-    """Build the environment with the vendor's package, if it is not there. Args: as of `home`.
-
-    Raises: DeviceStateError with what is missing, or pip's last line.
-    """
+    """Build the environment of a package if it is not there. Raises: DeviceStateError with what is missing."""
     if lack := missing(package, folder):
         raise DeviceStateError(f"the rig cannot be built: {lack}")
     env = home(package, folder)

@@ -25,7 +25,6 @@ class RigFamily(PioreactorFamily):
 
     @contextmanager
     def reached(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> Iterator[PioreactorConfig]:
-        """Units started for as long as the run lasts. Raises: ReactorError."""
         assert isinstance(backend, RigBackendConfig)
         cultures = dict(zip(backend.reactors, bench.volumes(backend.reactors).tolist(), strict=True))
         login = backend.username, backend.password()
@@ -38,7 +37,6 @@ class RigFamily(PioreactorFamily):
             )  # fmt: skip
 
     def address(self, backend: PioreactorConfig) -> str:
-        """In processes of this computer."""
         return "in this computer"
 
 

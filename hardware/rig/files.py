@@ -75,7 +75,6 @@ def flows(k: int) -> dict[str, float]:
 
 
 def model(volume_ml: float) -> str:
-    """Return the vendor's name of a unit with a vial for this culture."""
     return f"pioreactor_{vial_ml(volume_ml)}ml"
 
 
@@ -83,11 +82,7 @@ def layout(
     folder: Path, unit: str, hosts: Mapping[str, str], known: Facts, flow: Mapping[str, float],
     values: Mapping[str, object],
 ) -> None:  # fmt: skip
-    """Everything below a unit's folder.
-
-    Args: hosts: of all units. known: of the version. flow: of its pumps, mL/s. values: port, broker, database, login
-      and volume_ml.
-    """
+    """Everything below a unit's folder. Args: hosts: of all units. values: port, broker, database, login, volume_ml."""
     for name in FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     addresses = " ".join(f"{name}={host}" for name, host in hosts.items())

@@ -39,10 +39,9 @@ CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the 
 class Rig:
     """Everything that stands on a bench, as processes of this computer; use as a context manager.
 
-    Args: units: names, and culture of each up to its waste tube, mL; unit k is at 127.0.0.k, the first leads. config:
-      of software and vials. growth_x: how much faster than real time the cultures grow. truth: folder of truth.jsonl,
-      where another than the rig's own, which is removed with it. experiment: that all units are in. login: of
-      the broker.
+    Args: units: names, and culture of each up to its waste tube, mL; unit k is at 127.0.0.k, the first leads. growth_x:
+      how much faster than real time the cultures grow. truth: folder of truth.jsonl, if not the rig's own, which is
+      removed with it. experiment: that all units are in. login: of the broker.
     Attributes: version, of the software; web, address of each unit's web server; broker, port of MQTT; vials; folder;
       processes by name.
     Raises: DeviceStateError with what is missing or did not start.
@@ -125,7 +124,6 @@ class Rig:
         }  # fmt: skip
 
     def kill(self, name: str) -> None:
-        """Kill one process by kill -9."""
         self.processes[name].kill()
         self.processes[name].wait()
 
@@ -145,10 +143,7 @@ class Rig:
         _wait(self.hosts[unit], self.port, f"the web server of {unit}")
 
     def jobs(self, unit: str = "", job: str = "") -> list[int]:
-        """Process ids of the vendor's jobs of this name on a unit, by what the system says of them.
-
-        They have sessions of their own, and the unit's folder in their environment. Args: unit, job: "" for all.
-        """
+        """Process ids of the vendor's jobs of this name on a unit ("" for all), which have sessions of their own."""
         home = f"RUN_PIOREACTOR={self.folder / unit}{chr(0) if unit else '/'}".encode()
         found = []
         for path in Path("/proc").glob("[0-9]*"):
@@ -182,10 +177,7 @@ def _kill(pids: Sequence[int]) -> None:
 
 
 def _as_on_a_unit() -> None:
-    """In a child: hear every signal, and be killed when the process that started us is, whatever ended it.
-
-    The vendor stops jobs by SIGINT, which a worker process holds back and a shell's background job ignores.
-    """
+    """In a child: be killed with the process that started us, and hear SIGINT, by which the vendor stops jobs."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     with contextlib.suppress(OSError, AttributeError):

@@ -41,10 +41,7 @@ class Pulse:
 
 
 def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float], growth_x: float) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml`, pulse dosing, in the vendor's vial. Raises: ValueError for an unknown name.
-
-    Args: volume_ml: up to the waste tube. flow: of its pumps, mL/s.
-    """
+    """Preset `conf/plant/NAME.yaml` in the vendor's vial, with the flows of its pumps, mL/s. Raises: ValueError."""
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=float(vial_ml(volume_ml)))
     pump = replace(plant.pump, dosing="pulse", gain_ml_s=flow["media_pump"], waste_ml_s=flow["waste_pump"])
@@ -74,7 +71,6 @@ class _Vial:
 
     @property
     def seen_od(self) -> float:
-        """What the photodiode sees."""
         true = float(self.plant.apparent_od[0]) if math.isnan(self.held_od) else self.held_od
         return true + self.offset_od
 
@@ -128,12 +124,9 @@ class _Vial:
 
 
 class VialServer:
-    """All vials behind one UDP port, on a thread of its own.
+    """All vials behind one UDP port, on a thread of its own; truth.jsonl in a folder has every run of a pump.
 
-    Args:
-      plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
-      folder: truth.jsonl, every run of a pump and once a second every vial, is written here.
-    Attributes: port.
+    Args: plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
     """
 
     def __init__(self, plants: Mapping[str, PlantConfig], growth_x: float, folder: Path, seed: int = 0) -> None:
@@ -190,13 +183,11 @@ class VialServer:
         return {"volts": VOLTS_PER_OD * vial.seen_od}
 
     def power_cut(self, unit: str) -> None:
-        """Every pin of a unit falls to 0."""
         with self._lock:
             for pin in self.vials[unit].duty:
                 self.vials[unit].drive(pin, 0.0, 0, time.time())
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
         self._ended.set()
         self._thread.join(2.0)
         self._wire.close()

@@ -66,7 +66,6 @@ class FeedBudget:
         return allowed, findings
 
     def _room(self, now: float) -> dict[type[Fault], Array]:
-        """Return the mL that may still be fed, by what limits them, shape (N,) each."""
         c = self._config
         self._roll(now)
         recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)
@@ -93,9 +92,8 @@ class FeedBudget:
     def book(self, feed: Array, waste: Array, now: float) -> None:
         """Book what was dosed at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), V + feed where waste is 0.
 
-        Either may be negative: it corrects what was booked before it was known.
-
-        `now` may lie before what another reactor was booked at; what lies an hour back counts only for the run.
+        Either may be negative: it corrects what was booked before it was known. `now` may lie before what another
+        reactor was booked at; what lies an hour back counts only for the run.
         """
         self._roll(now)
         within = self._minute - now // 60.0 < 60.0

@@ -39,11 +39,7 @@ RAW_MIN, RAW_MAX = 5.0, 65534.0  # counts: a failed spectrometer reads 1, a satu
 
 @dataclass(frozen=True)
 class Responses:
-    """Responses of which a lab may choose others: report | hold | pumps_off | regulate | stop.
-
-    report: dose as allowed. hold: no dose. pumps_off: no dose and the pumps off, verified. regulate: hand over to the
-    device's own regulation for good. stop: no dose in this run any more.
-    """
+    """Responses of which a lab may choose others, by the words of `Response`; report is its PASS."""
 
     budget: str = setting(BudgetFault.response, "a feed budget is used up", choices=tuple(WORDS)[1:])
     jump: str = setting(JumpFault.response, "a step that neither growth nor a dose explains", choices=NOT_REGULATE)
@@ -134,10 +130,7 @@ class SafetyConfig:
         return self.composition_low, self.composition_high
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
-        """Ages of a newest sample that is stale and that is lost, s.
-
-        Raises: ValueError for an age that is over before the next sample comes.
-        """
+        """Ages at which a newest sample is stale and lost, s. Raises: ValueError for less than a control period."""
         stale_s = bench.stale_s if self.stale_s is None else self.stale_s
         lost_s = max(3.0 * bench.period_s, stale_s) if self.lost_s is None else self.lost_s
         require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")

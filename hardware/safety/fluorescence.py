@@ -13,10 +13,7 @@ __all__ = ["Light"]
 
 
 class Light:
-    """Plausibility of the newest fluorescence of N reactors, where it is measured; it is no basis of a dose.
-
-    Args: n: number of reactors; config: limits.
-    """
+    """Plausibility of the newest fluorescence of N reactors, where it is measured; it is no basis of a dose."""
 
     remembers = ("_light", "_light_repeats", "_light_s")
 

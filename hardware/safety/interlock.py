@@ -52,7 +52,6 @@ class Ruling:
 
     @property
     def kinds(self) -> tuple[tuple[str, ...], ...]:
-        """Per reactor the kinds of its faults."""
         return tuple(tuple(fault.kind for fault in faults) for faults in self.faults)
 
 
@@ -91,14 +90,11 @@ class Interlock:
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
     ) -> Ruling:
-        """Judge the newest samples and the proposed feed rates.
+        """Judge the newest samples and the proposed feed rates. Raises: nothing; what is wrong is in the verdict.
 
-        Args:
-          measurement: what the reactors said; `vitals` may be None.
-          rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh sample count.
-          setpoint: OD, shape (N,). temperature_target: degC, shape (N,), nan where there is no thermostat.
-          now: monotonic time, s; never goes back.
-        Raises: nothing; what is wrong is in the verdict.
+        Args: measurement: what the reactors said. rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh
+          sample count. setpoint: OD, (N,). temperature_target: degC, (N,), nan without a thermostat. now: monotonic
+          time, s.
         """
         rate, setpoint = np.array(rate, dtype=np.float64), np.array(setpoint, dtype=np.float64)
         target_c = np.asarray(temperature_target, dtype=np.float64)
@@ -128,17 +124,11 @@ class Interlock:
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
 
     def fluorescence(self, measurement: Measurement) -> Array | None:
-        """Fresh counts that may be believed, nan for all others, shape (N,); None where none are measured.
-
-        Asked before `check`, as `believes`; changes nothing.
-        """
+        """Fresh counts that may be believed, else nan, shape (N,), or None; asked before `check`, changes nothing."""
         return self._light.believed(measurement)
 
     def command(self, actuator: Actuator, asked: Array) -> Array:
-        """Cut what a signal asks of an actuator to its limits, in its unit, shape (N,); nan stays.
-
-        The next `check` tells of what was cut.
-        """
+        """Cut what a signal asks of an actuator to its limits, (N,); nan stays. The next `check` tells of it."""
         low, high = actuator.low, actuator.high
         if actuator.pump:
             low, high = 0.0, self.bench.max_rate
@@ -152,22 +142,21 @@ class Interlock:
         return np.asarray(allowed)
 
     def _reported(self, m: Measurement) -> list[list[Fault]]:
-        """Collect the faults that the reactors report themselves."""
         faults = m.vitals.faults if m.vitals is not None else (None,) * self.n
         return [[fault] if fault is not None else [] for fault in faults]
 
     def _collect(self, found: list[list[Fault]], findings: Sequence[Finding], now: float) -> None:
         """Add the findings to each reactor's faults; some begin a while without a dose."""
+        told = [[fault.kind for fault in faults] for faults in found]  # by the reactor, which says more
         for finding in findings:
             for i in np.flatnonzero(finding.rows):
-                found[i].append(finding.of(int(i)))
+                found[i] += [finding.of(int(i))] if finding.fault.kind not in told[i] else []
             if finding.cool is not None and self.config.response(finding.fault) is not Response.PASS:
                 pause = next(k for k, pause in enumerate(PAUSES) if pause.kind == finding.fault.kind)
                 self._hold_until_s = np.where(finding.cool, now + 60.0 * self.config.cooldown, self._hold_until_s)
                 self._hold_kind = np.where(finding.cool, float(pause), self._hold_kind)
 
     def _add_holds(self, found: list[list[Fault]], fresh: Mask, now: float) -> None:
-        """Add a pause, where its fault was found a while ago and is not found again now."""
         for i in np.flatnonzero(fresh & (now < self._hold_until_s)):
             pause = PAUSES[int(self._hold_kind[i])]
             if pause.kind not in [fault.kind for fault in found[i]]:
@@ -193,10 +182,7 @@ class Interlock:
         return Response.HOLD if isinstance(fault, PAUSES) else self.config.response(fault)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
-        """Book what was dosed; without a waste pump in the model the level stays at its tube.
-
-        Args: receipt: of the command that followed `check`; now: monotonic time of the dose, s.
-        """
+        """Book the receipt of a command at a time, s; without a waste pump in the model the level stays at its tube."""
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         self.budget.book(feed, waste, now)
@@ -218,10 +204,7 @@ class Interlock:
         return {key: value for part in (*self._parts, self) for key, value in memory.save(part).items()}
 
     def restore(self, state: Any) -> None:
-        """Restore the output of `state` into an interlock that has not been used.
-
-        Raises: ValueError if it is of another number of reactors or another version, or damaged.
-        """
+        """Restore the output of `state` into an unused interlock. Raises: ValueError for what does not fit."""
         if isinstance(state, dict) and (other := set(state) ^ set(self.state())):
             raise ValueError(f"interlock: its saved state has other fields: {', '.join(sorted(other))[:80]}")
         for part in (*self._parts, self):

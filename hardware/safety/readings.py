@@ -20,12 +20,10 @@ MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples
 
 @dataclass(frozen=True)
 class Finding:
-    """Something is wrong with some reactors.
+    """Something is wrong with some reactors: the fault, and its rows, shape (N,).
 
-    fault: what.
-    rows: the reactors concerned, shape (N,).
-    seen: the values of the fault's sentence, one for all or of shape (N,).
-    cool: reactors that get no dose for a while after this, unless the fault is only reported; None for none.
+    seen: the values of the fault's sentence, one for all or of shape (N,). cool: reactors that get no dose for a while
+    after this, unless the fault is only reported; None for none.
     """
 
     fault: type[Fault]
@@ -34,15 +32,11 @@ class Finding:
     cool: Mask | None = None
 
     def of(self, n: int) -> Fault:
-        """Say it of reactor n."""
         return self.fault(**{k: float(v[n]) if isinstance(v, np.ndarray) else v for k, v in self.seen.items()})
 
 
 class Readings:
-    """Age and plausibility of the newest sample of N reactors, each by itself.
-
-    Args: stale_s, lost_s: ages of a newest sample from which it is stale, and lost.
-    """
+    """Plausibility of the newest sample of N reactors, each by itself, and its age: stale_s or lost_s is too much."""
 
     remembers = ("_fresh_s", "_seen", "_repeats")
 

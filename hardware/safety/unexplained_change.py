@@ -45,10 +45,7 @@ class UnexplainedChange:
         self._eased = np.zeros(n)  # samples in a row that speak against it
 
     def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
-        """Judge the readings of the `believed` rows.
-
-        Args: reading, setpoint: OD, shape (N,). time_s: when it was taken, s, shape (N,).
-        """
+        """Judge the readings of the `believed` rows: OD and setpoint, when they were taken, s, all of shape (N,)."""
         od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
         step, down, suspects, settled = self._steps(od, t)
         self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
@@ -139,10 +136,7 @@ class UnexplainedChange:
         ]
 
     def _lasting(self, begins: Mask, od: Array, usual: Mask, short: Mask, limit: Array) -> Mask:
-        """Reactors in which full feed does not reach the setpoint, shape (N,).
-
-        Args: begins: a sum says so now. short: fed in full and above the setpoint. limit: of a fall of ln OD.
-        """
+        """Reactors in which full feed does not reach the setpoint: from when a sum says so until that has eased."""
         highest = np.fmax(self._helpless_od, np.where(usual, od, -math.inf))
         lasts = np.isfinite(self._helpless_od)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -158,5 +152,4 @@ class UnexplainedChange:
         self._excess[row] = self._over[row, 0] = self._since_low_ml[row] = 0.0
 
     def dosed(self, feed_ml: Array, low_ml: Array) -> None:
-        """Book what was dosed, at most and at least, mL, shape (N,)."""
         self._since_ml, self._since_low_ml = self._since_ml + feed_ml, self._since_low_ml + low_ml

@@ -12,11 +12,8 @@ def write(path: Path, data: bytes | str, fsync: bool = True) -> None:
     """Replace the content of `path` in one step: nobody ever reads half a file. Text is written as UTF-8.
 
     The data go into `path` + ".xxxxxxxx.part", which then takes the place of `path`. Each call has its own x: of
-    several processes that write one file at once, on one machine or on a shared disk, the last one's stands.
-
-    Args:
-      fsync: file and folder are on the disk when this returns; False leaves that to the operating system.
-    Raises: OSError where the disk refuses; `path` is then as it was.
+    several processes that write one file at once, on one machine or on a shared disk, the last one's stands. With fsync
+    file and folder are on the disk when this returns. Raises: OSError where the disk refuses; `path` is then as it was.
     """
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:

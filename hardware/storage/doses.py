@@ -34,7 +34,6 @@ class Given:
     pump: int = 0
 
     def row(self, why: str) -> dict[str, Any]:
-        """As the journal keeps what was given beside the doses that were commanded."""
         volumes = {"feed_ml": self.feed_ml, "feed_low_ml": self.low_ml, "waste_ml": self.waste_ml}
         return {"at_s": self.at_s, "why": why, **volumes, **({"pump": self.pump} if self.pump else {})}
 
@@ -93,7 +92,6 @@ class Ending:
         return first + again
 
     def row(self) -> dict[str, Any]:
-        """As the journal keeps it."""
         known = {key: value for key, value in asdict(self).items() if value == value and (key != "pump" or value)}
         return {"verified_off": True, "repeated_ml": self.repeated_ml, **known}
 
@@ -134,10 +132,9 @@ def feeds_by(row: Mapping[str, Any]) -> str:
 def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
     """Every dose of a journal with what it really gave, and what the device repeated of it, in the order of time.
 
-    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; what the
-    device repeated of it is told by the `dose_end` that a resumed run writes.
-
-    Args: rows: of a journal, oldest first. Raises: RecordingError for a row that is not as the driver wrote it.
+    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; a
+    resumed run's `dose_end` tells what was repeated of it. Raises: RecordingError for a row that is not as the driver
+    wrote it.
     """
     given: dict[int, Dosed] = {}  # by the row of the intent
     begun: dict[str, Dosed] = {}  # by reactor, the one that has not ended
@@ -165,7 +162,6 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
 
 
 def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
-    """Run time, s, and volumes of feed and waste, mL, of a row."""
     return float(row[when]), float(row["feed_ml"]), float(row["waste_ml"])
 
 

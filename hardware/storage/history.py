@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from hardware.storage.doses import damaged
 
-__all__ = ["History", "replayed"]
+__all__ = ["History"]
 
 
 @dataclass(frozen=True)
@@ -59,24 +59,17 @@ class History:
             return replace(known, handed_over=setpoint, open=False)
         return known
 
-
-H = TypeVar("H", bound=History)
-
-
-def replayed(rows: Sequence[Mapping[str, Any]], unknown: H) -> dict[str, H]:
-    """Replay the journal of a run for each reactor.
-
-    Args: rows: that a driver has written, oldest first. unknown: of a reactor without rows.
-    Raises: RecordingError for a row that is not as the driver wrote it.
-    """
-    known: dict[str, H] = {}
-    seen_s = 0.0
-    for row in rows:
-        seen_s = max(seen_s, float(row.get("time_s") or 0.0))
-        if row.get("kind") in unknown.KINDS:
-            try:
-                name = str(row["reactor"])
-                known[name] = known.get(name, unknown).after(row)
-            except (IndexError, KeyError, TypeError, ValueError) as error:
-                raise damaged(row, error) from None
-    return {name: replace(entry, seen_s=seen_s) for name, entry in known.items()}
+    @classmethod
+    def replay(cls, rows: Sequence[Mapping[str, Any]]) -> dict[str, Self]:
+        """Replay the rows of a journal, oldest first, for each reactor. Raises: RecordingError for a damaged row."""
+        known: dict[str, Self] = {}
+        seen_s = 0.0
+        for row in rows:
+            seen_s = max(seen_s, float(row.get("time_s") or 0.0))
+            if row.get("kind") in cls.KINDS:
+                try:
+                    name = str(row["reactor"])
+                    known[name] = known.get(name, cls()).after(row)
+                except (IndexError, KeyError, TypeError, ValueError) as error:
+                    raise damaged(row, error) from None
+        return {name: replace(entry, seen_s=seen_s) for name, entry in known.items()}

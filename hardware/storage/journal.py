@@ -63,10 +63,7 @@ def _tail(path: Path, before: int) -> bytes:
 
 
 def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
-    """Yield rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory.
-
-    These are LANDMARKS and, of each reactor whose dose is open at byte `before`, its rows from that dose on.
-    """
+    """Yield LANDMARKS of the first `before` bytes and, of each reactor whose dose is open there, its rows since."""
     kept: dict[int, bytes] = {}  # by where they begin
     dose: dict[bytes, dict[int, bytes]] = {}
     at = 0
@@ -92,13 +89,11 @@ def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
 class Journal:
     """One row per event: {"n": number, "wall": s since 1970, "mono": s, "kind": ..., fields...}.
 
-    Rows are written with one write call and one fsync, so a row that `append` returned from survives a kill at once,
-    a power cut, and a full disk. Kinds and fields belong to whoever writes them.
+    Rows are written with one write call and one fsync, so a row that `append` returned from survives a kill at once, a
+    power cut, and a full disk. Kinds and fields belong to whoever writes them.
 
-    Args:
-      path: file, created if missing; its folder must exist.
-      wall: clock of the day, s since 1970; only ever for the record and for the position of a resumed run.
-      fsync: False leaves the flushing to the operating system: survives a kill, not a power cut (simulated runs).
+    Args: wall: clock of the day; only ever for the record and for the position of a resumed run. fsync: False leaves
+      the flushing to the operating system: survives a kill, not a power cut (simulated runs).
     Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
       file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, doses left open, and the last 20 MB;
       next_row, the number the next row will have.
@@ -174,7 +169,6 @@ class Journal:
         return list(_parse(newest, self.path))
 
     def close(self) -> None:
-        """Release the file. Idempotent."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -192,7 +186,6 @@ def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _check(rows: list[dict[str, Any]], path: Path) -> None:
-    """Whether every row has what all rows have. Raises: RecordingError."""
     kinds: dict[str, Any] = {"n": int, "wall": (int, float), "kind": str}
     for row in rows:
         wrong = [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]
@@ -202,10 +195,7 @@ def _check(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """All whole rows, oldest first, and how many bytes of a torn last line follow them; the file stays untouched.
-
-    Raises: RecordingError if the file is missing or damaged elsewhere than at its end.
-    """
+    """All whole rows, oldest first, and how many bytes of a torn last line follow them. Raises: RecordingError."""
     try:
         data = path.read_bytes()
     except OSError as error:

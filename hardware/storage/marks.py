@@ -38,15 +38,11 @@ class Mark:
 
     @property
     def measured(self) -> bool:
-        """Whether the run takes something over."""
         return (self.level_ml, self.share, self.bottle_ml) != (None, None, None)
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
-    """Append a mark to a run folder, on the disk when this returns; the running program takes over what was measured.
-
-    Raises: RecordingError if the disk refuses or the file is another one.
-    """
+    """Append a mark to a run folder, on the disk when this returns; the run takes it over. Raises: RecordingError."""
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with _alone(folder), Recorder(folder / NAME, COLUMNS) as file:
         cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, *(getattr(mark, key) for key in MEASURED))
@@ -56,7 +52,6 @@ def add_mark(folder: Path, mark: Mark) -> Path:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Nobody else adds a mark to this folder meanwhile."""
     held = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)

@@ -25,11 +25,8 @@ class Recorder(AbstractContextManager["Recorder"]):
     Each row is one `write` on an O_APPEND descriptor, then fsync. An existing file is continued: a last line torn by a
     crash is cut off and reported in `repaired`.
 
-    Args:
-      path: of the CSV; its folder must exist.
-      columns: names with their unit, e.g. ("time_min", "od", "pump_rate_ml_s"); unique.
-      fsync: False leaves rows in the operating system's cache (simulations that can be repeated).
-      remedy: what to do about a file that is another one.
+    Args: columns: unique names with their unit. fsync: False leaves rows in the operating system's cache (simulations
+      that can be repeated). remedy: what to do about a file that is another one.
     Raises: RecordingError if the file cannot be opened or has another header; ValueError for unusable column names.
     """
 
@@ -53,12 +50,7 @@ class Recorder(AbstractContextManager["Recorder"]):
             raise
 
     def write(self, row: Mapping[str, Value]) -> None:
-        """Append one row; it is on the disk when this returns (with fsync).
-
-        Args:
-          row: a value for each column; None and nan leave the cell empty.
-        Raises: RecordingError for missing or unknown columns, and when the disk refuses.
-        """
+        """Append one row, a value for each column, to the disk; None and nan are empty. Raises: RecordingError."""
         if row.keys() != set(self.columns):
             missing = [c for c in self.columns if c not in row]
             unknown = [c for c in row if c not in self.columns]
@@ -77,7 +69,6 @@ class Recorder(AbstractContextManager["Recorder"]):
         return not (self.path.exists() and os.path.samestat(self.path.stat(), os.fstat(self._fd)))
 
     def close(self) -> None:
-        """Close the file. Idempotent."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

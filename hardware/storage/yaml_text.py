@@ -18,10 +18,7 @@ def problem(error: Exception) -> str:
 
 
 def read_text(path: Path | str) -> str:
-    """Read a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
-
-    Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
-    """
+    """Read a YAML file; aliases, which can stand for gigabytes, are refused. Raises: OSError; ValueError."""
     with open(path, "rb") as f:
         data = f.read(LARGEST + 1)
     if len(data) > LARGEST:

@@ -27,10 +27,7 @@ CYCLE_S = 56.0  # sooner no sample follows another
 
 
 class WatchedChiBio(Watched):
-    """One reactor that the device itself, or somebody, regulates.
-
-    Args: get: sends a GET. flow_ml_s: of its feed pump at full power. poll_s: from one look to the next.
-    """
+    """One reactor that the device or somebody regulates, read by `get` every poll_s; flow_ml_s: of its feed pump."""
 
     def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float, poll_s: float) -> None:
         super().__init__((name,))
@@ -40,11 +37,9 @@ class WatchedChiBio(Watched):
         self._newest = np.full(5, math.nan)  # at, OD, temperature, raw, blank
 
     def elapsed(self) -> float:
-        """See `Reactor.elapsed`."""
         return self._clock.now() - self._began_s
 
     def measure(self) -> Measurement:
-        """Look until there is a new sample, or for a while. Raises: nothing; trouble is in `vitals`."""
         self._clock.sleep(max(self._arrived_s + CYCLE_S - self._clock.now(), 0.0))
         until_s, fault, fresh = self._clock.now() + AGAIN_S, None, False
         while not fresh and self._clock.now() < until_s:
@@ -58,7 +53,6 @@ class WatchedChiBio(Watched):
         return Measurement(at, od, warm, np.full(1, fresh), Vitals(age, raw, (fault,), blank))
 
     def _look(self) -> tuple[bool, Fault | None]:
-        """Whether a new sample came, and what is wrong. Raises: ReactorError."""
         reply = self._get("/getSysdata/")
         if reply.status != 200:
             raise WrongStatus(request="GET /getSysdata/", status=reply.status, expected=200)
@@ -79,10 +73,7 @@ class WatchedChiBio(Watched):
         return True, None
 
     def _fed_ml(self, data: dict[str, Any], state: DeviceState) -> float:
-        """Volume that the feed pump was told to give from the last sample to this one, by the device's own records.
-
-        A record's duty acts until the next one.
-        """
+        """Volume that the feed pump was told to give since the last sample: a record's duty acts until the next one."""
         times, duties = (data[key].get("record", []) for key in ("time", FEED))
         n = min(len(times), len(duties))
         time, duty = np.array(times[len(times) - n :], dtype=float), np.array(duties[len(duties) - n :], dtype=float)

@@ -33,12 +33,10 @@ class WatchedFamily(Family):
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Watched]:
-        """See `Family.open`; nothing is checked but whether it answers. Raises: ReactorError."""
         with self._opened(opening.backend, opening.bench) as reactors:
             yield reactors
 
     def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
-        """See `Family.preflight`; by reading alone. Raises: ReactorError."""
         with self._opened(backend, bench) as reactors:
             m = reactors.measure()
         faults = m.vitals.faults if m.vitals is not None else (None,) * len(m.od)
@@ -59,7 +57,6 @@ class WatchedFamily(Family):
             yield WatchedChiBio(link.get, clock, name, calibration.feed.flow_ml_s, backend.poll_s)
 
     def fits(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario], ends: Sequence[str]) -> None:
-        """See `Family.fits`. Raises: UnfitError."""
         said = "watch=true: "
         if backend.kind not in KINDS:
             raise UnfitError(f"{said}backend={backend.kind}: allowed {', '.join(KINDS)}")
@@ -73,13 +70,10 @@ class WatchedFamily(Family):
         self._of.fits(backend, bench, scenarios, ends)
 
     def actuators(self, backend: Any) -> tuple[Actuator, ...]:
-        """See `Family.actuators`."""
         return self._of.actuators(backend)
 
     def rim_ml(self, volumes_ml: Array) -> Array | float:
-        """See `Family.rim_ml`."""
         return self._of.rim_ml(volumes_ml)
 
     def address(self, backend: Any) -> str:
-        """See `Family.address`."""
         return self._of.address(backend)

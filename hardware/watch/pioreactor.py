@@ -38,11 +38,9 @@ class WatchedPioreactors(Watched):
             real.sleep(LOOK_S)
 
     def elapsed(self) -> float:
-        """See `Reactor.elapsed`."""
         return self._clock.now() - self._began_s
 
     def measure(self) -> Measurement:
-        """Listen until a unit has a sample, or for a while. Raises: nothing; trouble is in `vitals`."""
         until_s, fresh = self._real.now() + AGAIN_S, [False] * len(self.names)
         while not any(fresh) and self._real.now() < until_s:
             self._real.sleep(LOOK_S)
@@ -58,7 +56,6 @@ class WatchedPioreactors(Watched):
         return Measurement(at - self._began_s, od, warm, np.array(fresh), Vitals(age, raw, faults))
 
     def _listen(self, n: int, unit: str) -> bool:
-        """Take what a unit said; whether it has a new sample."""
         readings, events, _ = self.boxes[unit].drain()
         now, mine = self._clock.now(), np.arange(len(self.names)) == n
         for event in events:
@@ -70,5 +67,4 @@ class WatchedPioreactors(Watched):
         return self.sampling[n].look(now, since_s)
 
     def close(self) -> None:
-        """Leave the broker. Idempotent."""
         self.mqtt.close()

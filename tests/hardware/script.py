@@ -19,7 +19,7 @@ DONE = Reply(204, b"")
 def state(name: str = "M0", **changes: Any) -> dict[str, Any]:
     """sysData of a reactor in a running experiment with one sample; `changes` by dotted path with __ for the dots."""
     device = ChiBioDevice(("M0", "M1"), VirtualClock(), np.random.default_rng(0))
-    software = device.supervisor.worker.software
+    software = device.supervisor.software
     software.select(name)
     data: dict[str, Any] = json.loads(software.sysdata())
     data["OD0"].update(target=14000.0, raw=9000.0)

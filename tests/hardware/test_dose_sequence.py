@@ -13,7 +13,7 @@ from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.dose_sequence import Context, DoseSequence
+from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.protocol import Permitted
 from hardware.chibio.resume import ReactorHistory
@@ -79,8 +79,8 @@ class Bench:
         self.connection = Connection("M0", Permitted(("M0",)), self.line, self.clock, self._log)
         self.book = Logbook("M0", self._log, self._log, lambda: self.clock.now() - 1000.0)
         calibration = calibration or ReactorCalibration()
-        parts = self.connection, 20.0, calibration, ChiBioConfig(), self.agenda, self.book, lambda: self.known
-        self.doses = DoseSequence(Context(*parts))
+        parts = self.connection, calibration, ChiBioConfig(), self.agenda, self.book, lambda: self.known
+        self.doses = DoseSequence(*parts)
         start = self.connection.read().start_time
         self._log("device", {"start_time": start})
         self.line.posts.clear()

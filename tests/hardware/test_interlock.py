@@ -120,6 +120,13 @@ def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_i
         assert later.rate[0] > 0.0 or kind in ("overflow", "bottle", "budget")
 
 
+def test_what_a_reactor_tells_of_doses_that_it_does_not_take_stands_in_the_place_of_what_the_ledger_shows() -> None:
+    drive, fault = Drive(), KINDS["undosed"]("its lock")
+    for k in range(4):
+        verdict = drive(od=0.5 + 0.001 * k, rate=0.02, dosed=False, fault=fault)
+    assert verdict.faults == ((fault,),)
+
+
 def test_every_declared_reason_is_tried() -> None:
     elsewhere = {"no_dilution", "cannot_hold", "fluorescence", "fluorescence_lost", "command_limit"}
     assert set(TRIGGERS) | set(OF_DEVICES) | elsewhere == set(KINDS)

@@ -198,8 +198,11 @@ def test_an_event_that_a_bridge_brings_twice_is_booked_once_and_a_late_correctio
     assert lab.given() == pytest.approx((11.7, 11.7))
 
 
-def test_excesses_that_are_little_each_are_booked_once_they_are_much(lab):
-    planned, lab.world.late_s = 0.0, 0.1
+@pytest.mark.parametrize("late_s", [0.1, 0.3])
+def test_excesses_of_jobs_that_end_late_are_booked_once_they_are_much_and_taken_by_the_waste_of_their_doses(
+    lab, late_s
+):
+    planned, lab.world.late_s = 0.0, late_s
     for _ in range(10):
         planned += lab.dose(0.5)
         lab.wait(10.0)
@@ -207,6 +210,9 @@ def test_excesses_that_are_little_each_are_booked_once_they_are_much(lab):
     truth = lab.world.truth["add_media"]
     assert truth > planned + 0.5
     assert float(lab.ledger(planned).fed_ml[0]) == pytest.approx(truth, abs=LATE_ML + 0.02)
+    assert not noted(lab.rows, messages.Drained), "no pump ran on"
+    assert len(lab.asked("remove_waste")) == 10
+    assert lab.world.truth["remove_waste"] >= truth
 
 
 @pytest.mark.parametrize(

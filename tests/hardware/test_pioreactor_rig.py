@@ -74,8 +74,8 @@ def test_stirring_and_thermostat_run_follow_their_target_and_come_back_after_a_r
         return all(box.state(job).word == "ready" for job in ("stirring", "temperature_automation"))
 
     assert bench.go_on(running)
-    assert bench.go_on(lambda: bench.station.newest.temperature > 20.0)
-    assert bench.station.newest.temperature == pytest.approx(bench.temperature(), abs=0.5)
+    assert bench.go_on(lambda: bench.station.sampling.temperature > 20.0)
+    assert bench.station.sampling.temperature == pytest.approx(bench.temperature(), abs=0.5)
     bench.station.set_temperature(33.0)
     assert bench.go_on(lambda: box.target == 33.0)
     assert bench.target() == 33.0

@@ -206,8 +206,13 @@ def test_a_reader_that_brings_nothing_is_noticed_and_started_anew_whatever_it_sa
     assert lab.dose(0.5) == 0.5
 
 
-def test_silence_is_told_in_the_age_of_the_sample(monkeypatch):
-    lab = sampled(monkeypatch)
+def test_silence_is_told_in_the_age_of_the_sample_and_counted_from_the_start_at_most(monkeypatch):
+    lab = Lab(monkeypatch)
+    lab.world.sleep(200.0)  # a preflight, say
+    lab.world.od_s = 14.0
+    lab.begin()
+    assert lab.reactors.measure().vitals.age_s[0] < lab.bench.stale_s
+    lab.sample()
     lab.world.od_s = 1e9
     for _ in range(8):
         m = lab.reactors.measure()

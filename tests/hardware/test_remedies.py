@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from hardware.chibio import messages as chibio
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.diagnosis import diagnose
 from hardware.chibio.messages import NoNumber, NoSamples
@@ -13,6 +14,8 @@ from hardware.chibio.protocol import parse_state
 from hardware.link.http import HttpTransport
 from hardware.link.messages import NotAnswered, NotReached
 from hardware.link.transport import TransportConfig
+from hardware.messages import Fault
+from hardware.pioreactor import messages as pioreactor
 from tests.hardware.script import state
 from tests.hardware.test_diagnosis import EXPECTED
 from tests.hardware.test_http_transport import Server
@@ -42,3 +45,8 @@ def test_who_is_not_reached_is_another_than_who_does_not_answer() -> None:
     with pytest.raises(NotReached):
         link.get("/getSysdata/")
     link.close()
+
+
+def test_every_fault_that_a_driver_tells_says_what_helps() -> None:
+    told = [m for room in (chibio, pioreactor) for m in vars(room).values() if isinstance(m, type)]
+    assert [m.__name__ for m in told if issubclass(m, Fault) and m.says and not m.remedy] == []

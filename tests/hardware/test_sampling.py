@@ -57,13 +57,13 @@ def test_only_a_sample_that_was_waited_for_has_a_known_age() -> None:
     sampling = Sampling(CONFIG, clock)
     take(sampling, clock, sample(0.0, 1))
     assert sampling.appeared_s == -math.inf
-    assert sampling.next_poll == clock.now() + CYCLE_S - 20.0  # it may have waited long: look early
+    assert sampling.next_look == clock.now() + CYCLE_S - 20.0  # it may have waited long: look early
     clock.sleep(50.0)
     sampling.not_taken(is_new=False)
     clock.sleep(2.0)
     take(sampling, clock, sample(60.0, 2))
     assert sampling.appeared_s == clock.now()
-    assert sampling.next_poll == clock.now() + CYCLE_S - 2.5
+    assert sampling.next_look == clock.now() + CYCLE_S - 2.5
     clock.sleep(70.0)  # ten seconds later than possible
     take(sampling, clock, sample(120.0, 3))
     assert sampling.late_s == 10.0
@@ -122,9 +122,9 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
 def test_looks_are_as_far_apart_as_is_set() -> None:
     clock = VirtualClock(500.0)
     sampling = Sampling(replace(CONFIG, poll_s=7.0), clock)
-    assert sampling.next_poll == sampling.arrived_s == 500.0
+    assert sampling.next_look == sampling.arrived_s == 500.0
     sampling.look(sample(math.nan, 0), 500.0)
-    assert sampling.next_poll == 507.0
+    assert sampling.next_look == 507.0
 
 
 def test_a_sample_is_made_of_its_own_numbers() -> None:

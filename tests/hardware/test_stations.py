@@ -32,7 +32,7 @@ from hardware.pioreactor import family as pioreactor
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.reactor import Command
 from hardware.simulated import FAMILY, SimulatedConfig, SimulatedReactors
-from hardware.stations import Newest, Stations
+from hardware.stations import Stations
 from hardware.storage.doses import Given
 from hardware.storage.journal import Journal
 from hardware.storage.messages import JournalMissing
@@ -49,10 +49,7 @@ class One:
         self.doses = SimpleNamespace(extra=[], carry_ml=0.0)
         self.at, self.arrived_s, self.od, self.blank = NAN, 0.0, NAN, blank
         self.next_look, self.handed_over, self.fails = math.inf, False, ""
-
-    @property
-    def newest(self) -> Newest:
-        return Newest(self.at, self.od, 36.0, 9000.0, self.arrived_s, self.blank)
+        self.temperature, self.raw, self.fluorescence, self.sampling = 36.0, 9000.0, None, self
 
     def poll(self) -> bool:
         self.at, self.arrived_s, self.od = self.clock.now() - 3.0, self.clock.now(), 0.4
