@@ -189,41 +189,50 @@ def test_medians_of_costs_and_of_differences_are_those_of_the_replicates_and_not
     assert late["lower_in"] == 0
 
 
-def test_settling_is_the_first_moment_after_which_the_band_is_kept():
-    t = np.arange(0.0, 31.0)[None]
-    od = np.where(t < 10, 0.8, 0.5)
-    od[0, 14] = 0.53  # outside 5 % of 0.5 once more
-    m = window_metrics(t, od, 0.5, 0.0, 30.0)
-    assert m.settling_min[0] == 15.0
-    assert m.steady_abs_error[0] == 0.0
+MIN, NAN = np.arange(31.0), math.nan
+LATE = np.arange(91.0) - 30.0
+HOLES = np.isin(MIN, (3, 4)), np.isin(MIN, (7, 20))
+FEW = np.array([[0.0, 30.0, NAN], [29.0, NAN, NAN], [0.0, 1.0, 19.9], [0.0, 1.0, 20.0]]) + 30.0
+METRICS: dict[str, tuple[np.ndarray, np.ndarray, tuple[float, float], dict[str, list[float]]]] = {
+    "settled is the first moment after which the band is kept; at minute 14 it is left once more": (
+        MIN, np.select([MIN < 10, MIN == 14], [0.8, 0.53], 0.5), (0.0, 30.0),
+        {"settling_min": [15.0], "steady_abs_error": [0.0]},
+    ),
+    "two samples make a metric, one makes none, the end needs its own; time counts from the window": (
+        FEW, np.where(np.isfinite(FEW), 0.6, NAN), (30.0, 60.0),
+        {"ise": [0.3, NAN, 0.199, 0.2], "itae": [45.0, NAN, 19.8005, 20.0], "settling_min": [NAN] * 4,
+         "steady_abs_error": [0.1, NAN, NAN, 0.1]},
+    ),
+    "a linear error is bridged exactly where samples are missing, by their time or their OD": (
+        np.stack([MIN, np.where(HOLES[0], NAN, MIN)]), 0.5 + 0.01 * np.stack([MIN, np.where(HOLES[1], NAN, MIN)]),
+        (0.0, 30.0), {"abs_error": [0.15, 0.15], "ise": [0.9005, 0.9011]},
+    ),
+    "no sample": (np.empty((2, 0)), np.empty((2, 0)), (0.0, 30.0), {key: [NAN] * 2 for key in (
+        "ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error")}),
+    "20 % too high for 12 min and 4 % too low, or too low for 20 min and 4 % too high: trapezia of |e|": (
+        np.stack([LATE, LATE]) + 30.0,
+        0.5 + np.stack([np.where(LATE < 12.0, 0.1, -0.02), np.where(LATE < 20.0, -0.1, 0.02)]), (30.0, 60.0),
+        {"settling_min": [12.0, 20.0], "abs_error": [1.52 / 30.0, 2.16 / 30.0], "ise": [0.1224, 0.1992],
+         "ise_mean": [0.1224 / 30.0, 0.1992 / 30.0]},
+    ),
+    "the steady error is of the last ten minutes with both their ends: not of 19, but of 20 and 30": (
+        np.stack([MIN, MIN]), 0.52 + np.stack([0.38 * (MIN == 19) + 0.11 * (MIN == 20), -0.11 * (MIN == 30)]),
+        (0.0, 30.0), {"steady_abs_error": [(0.13 + 0.2) / 11, (0.09 + 0.2) / 11]},
+    ),
+    "without its first two and last two samples it is integrated over the others": (
+        MIN, np.where((MIN > 1) & (MIN < 29), 0.6, NAN), (0.0, 30.0),
+        {"ise": [0.26], "itae": [0.1 * (28.0**2 - 2.0**2) / 2], "abs_error": [2.6 / 30.0]},
+    ),
+}  # fmt: skip
 
 
-def test_two_samples_make_a_metric_one_makes_none_and_the_end_needs_a_sample_of_its_own():
-    """e = 0.1 over 30 min: ISE 0.3, ITAE 45; time counts from the window, not from the run."""
-    t = np.array([[0.0, 30.0, np.nan], [29.0, np.nan, np.nan], [0.0, 1.0, 19.9], [0.0, 1.0, 20.0]]) + 30.0
-    m = window_metrics(t, np.where(np.isfinite(t), 0.6, np.nan), 0.5, 30.0, 60.0)
-    np.testing.assert_allclose(m.ise, [0.3, np.nan, 0.199, 0.2])
-    np.testing.assert_allclose(m.itae, [45.0, np.nan, 19.8005, 20.0])
-    np.testing.assert_allclose(m.steady_abs_error, [0.1, np.nan, np.nan, 0.1])
-    assert np.isnan(m.settling_min).all()
-
-
-def test_missing_samples_are_bridged():
-    """A linear error is integrated exactly by trapezia, however many samples are missing between."""
-    t = np.arange(0.0, 31.0)
-    od = 0.5 + 0.01 * t
-    full = window_metrics(t[None], od[None], 0.5, 0.0, 30.0)
-    holes_t, holes_od = t.copy(), od.copy()
-    holes_t[[3, 4]], holes_od[[7, 20]] = np.nan, np.nan
-    holes = window_metrics(holes_t[None], holes_od[None], 0.5, 0.0, 30.0)
-    assert full.ise[0] == pytest.approx(1e-4 * 30**3 / 3, rel=2e-3)
-    assert holes.ise[0] == pytest.approx(full.ise[0], rel=5e-3)
-
-
-def test_a_run_without_a_sample_has_no_metrics():
-    metrics = window_metrics(np.empty((2, 0)), np.empty((2, 0)), 0.5, 0.0, 30.0)
-    for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
-        np.testing.assert_array_equal(getattr(metrics, key), [np.nan, np.nan])
+@pytest.mark.parametrize("name", METRICS)
+def test_metrics_of_a_window_by_hand(name: str) -> None:
+    minute, od, window, expected = METRICS[name]
+    found = window_metrics(np.atleast_2d(minute), np.atleast_2d(od), 0.5, *window)
+    for key, values in expected.items():
+        np.testing.assert_allclose(getattr(found, key), values, atol=1e-12, err_msg=key)
+    np.testing.assert_allclose(found.itae_mean, found.itae / (window[1] - window[0]))
 
 
 def test_the_last_two_hours_begin_no_earlier_than_the_window():
@@ -234,41 +243,6 @@ def test_the_last_two_hours_begin_no_earlier_than_the_window():
     found = [mean_errors(minute, 0.5 - error, np.full_like(minute, 0.5), *w) for w in ((300.0, 390.0), (390.0, 590.0))]
     assert [value[0] for value in found[0]] == pytest.approx([0.03, 0.03])
     assert [value[0] for value in found[1]] == pytest.approx([(80 * 0.2 + 120 * 0.05) / 200, 0.05])
-
-
-def test_a_later_window_counts_from_its_own_start_on_either_side_of_its_setpoint() -> None:
-    """From minute 30 on: 20 % too high for 12 min, then 4 % too low; the other 4 % too high after 20 min of too low."""
-    minute = np.tile(np.arange(0.0, 91.0), (2, 1))
-    t = minute[0] - 30.0
-    od = 0.5 + np.stack([np.where(t < 12.0, 0.1, -0.02), np.where(t < 20.0, -0.1, 0.02)])
-    m = window_metrics(minute, od, 0.5, 30.0, 60.0)
-    assert m.settling_min.tolist() == [12.0, 20.0]
-    whole = [(11 * 0.1 + 0.06 + 18 * 0.02) / 30.0, (19 * 0.1 + 0.06 + 10 * 0.02) / 30.0]  # trapezia of |e|
-    np.testing.assert_allclose(m.abs_error, whole)
-    ise = np.array([11 * 0.01 + 0.0052 + 18 * 0.0004, 19 * 0.01 + 0.0052 + 10 * 0.0004])
-    np.testing.assert_allclose(m.ise, ise)
-    np.testing.assert_allclose(m.ise_mean, ise / 30.0)
-    np.testing.assert_allclose(m.itae_mean, m.itae / 30.0)
-
-
-def test_the_steady_error_is_that_of_the_last_ten_minutes_with_both_their_ends() -> None:
-    """Minutes 20 to 30 of 30: the sample at 19 is not one of them, those at 20 and at 30 are."""
-    minute = np.tile(np.arange(0.0, 31.0), (2, 1))
-    od = np.full((2, 31), 0.52)
-    od[0, 19], od[0, 20], od[1, 30] = 0.9, 0.63, 0.41
-    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
-    np.testing.assert_allclose(m.steady_abs_error, [(0.13 + 10 * 0.02) / 11, (0.09 + 10 * 0.02) / 11])
-
-
-def test_a_window_whose_first_sample_is_missing_is_integrated_from_the_next_one() -> None:
-    """e = 0.1 from minute 2 on of 30, and to minute 28; |e| by time is half of 28^2 - 2^2, times 0.1."""
-    minute = np.arange(0.0, 31.0)[None]
-    od = np.full((1, 31), 0.6)
-    od[0, [0, 1, 29, 30]] = np.nan
-    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
-    assert m.ise[0] == pytest.approx(26 * 0.01)
-    assert m.itae[0] == pytest.approx(0.1 * (28.0**2 - 2.0**2) / 2)
-    assert m.abs_error[0] == pytest.approx(26 * 0.1 / 30.0)
 
 
 class Told:
