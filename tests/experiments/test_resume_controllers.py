@@ -31,7 +31,7 @@ pytestmark = pytest.mark.numeric
 
 NAMES = ("M0", "M1", "M2")
 KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold", "gain_scheduled", "inverse ekf", "dqn ekf")
-SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5, announce_min=30.0)
+SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5, announce_min="auto")
 LENGTH, CUT = 44, 26
 HOLD = Scenario((0.5,), (600.0,), (37.0,))
 REQUESTS = {  # what a program is killed at -> whether the dose under way was given
