@@ -235,9 +235,9 @@ def worth(run: Density, kind: str, plant: str, schedule: Scenario) -> str:
 
 
 def bound(run: Density, plant: str, schedule: Scenario) -> list[str]:
-    """What announcing is worth on the true state: to the same controller, to the best plan; and that plan beside ours.
+    """What announcing is worth on the true state: the same rule beside `inverse`, the best plan beside each controller.
 
-    All in per cent of what `inverse` has on its estimate and without announcement.
+    In per cent of what the controller has on its estimate and without announcement.
     """
 
     def mean(kind: str, told: bool, metric: str) -> float:
@@ -245,9 +245,10 @@ def bound(run: Density, plant: str, schedule: Scenario) -> list[str]:
 
     rows = []
     for metric in METRICS:
-        ours, exact = mean("inverse", False, metric), mean(f"inverse{TRUE}", False, metric)
-        same, best = mean(f"inverse{TRUE}", True, metric), mean(f"{PLAN}{metric}", False, metric)
-        rows.append([f"{100.0 * part / ours:+.0f}" for part in (same - exact, best - exact, best - ours)])
+        exact, half = (mean(f"inverse{TRUE}", told, metric) for told in (False, True))
+        best = mean(f"{PLAN}{metric}", False, metric)
+        parts = [(half, "inverse"), *((best, kind) for kind in CONTROLLERS)]
+        rows.append([f"{100.0 * (found - exact) / mean(kind, False, metric):+.0f}" for found, kind in parts])
     return [" / ".join(pair) for pair in zip(*rows, strict=True)]
 
 
@@ -281,7 +282,7 @@ def ceilings(c: CeilingsConfig, folder: Path) -> None:
     body = [[plant, name, *(worth(run, kind, plant, s) for kind in CONTROLLERS)] for plant, name, s in named]
     leave(folder, __file__, ["plant", "setpoints", *CONTROLLERS], body, "announced")
     body = [[plant, name, *bound(run, plant, s)] for plant, name, s in named]
-    columns = ["plant", "setpoints", "the same, true state", "best plan, true state", "best plan beside inverse"]
+    columns = ["plant", "setpoints", "half-way, inverse", *(f"best plan, {kind}" for kind in CONTROLLERS)]
     leave(folder, __file__, columns, body, "announced_bound")
     leave(folder, __file__, ["kind", *c.plants], alarms(run, c.plants), "announced_alarms")
 
