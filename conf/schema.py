@@ -31,8 +31,9 @@ Kinds = Callable[[str, str], Any]
 class Meaning:
     """Meaning of a field and its allowed values. Bounds of a tuple apply to each of its entries.
 
-    interval: a pair [low, high], rising. some: a tuple that may not be empty. kinds: function of kind ("": not given)
-    and key that returns the default config of a part, or of parts by name; raises ValueError with the known kinds.
+    interval: a pair [low, high], rising. some: a tuple that may not be empty. words: allowed in place of a number.
+    kinds: function of kind ("": not given) and key that returns the default config of a part, or of parts by name;
+    raises ValueError with the known kinds.
     """
 
     what: str
@@ -45,11 +46,12 @@ class Meaning:
     interval: bool = False
     some: bool = False
     note: str = ""
+    words: tuple[str, ...] = ()
     kinds: Kinds | None = None
 
     def holds(self, given: Any) -> bool:
         """Return whether a value is in range; nan never is."""
-        if given is None:
+        if given is None or given in self.words:
             return True
         if isinstance(given, Sequence) and not isinstance(given, str):
             if self.interval and not (len(given) == 2 and given[0] <= given[1]):
@@ -74,8 +76,8 @@ class Meaning:
             words = f"each {'one of ' if self.choices else ''}{words}"
         if self.some:
             words = f"one or more, {words}" if words else "one or more"
-        if words and optional:
-            words += ", or null"
+        if words:
+            words = ", or ".join([words, *self.words, *["null"] * optional])
         return words + (f" ({self.note})" if words and self.note else "")
 
     def _range(self, name: str) -> str:
@@ -281,6 +283,8 @@ def _scalar(given: Any, hint: Any, key: str, said: Meaning) -> Any:
         word = str(given).lower()
         require(word in (*TRUE, *FALSE), key, given, "true or false")
         return word in TRUE
+    if given in said.words:
+        return given
     if hint in (int, float):
         try:
             if isinstance(given, str | int | hint) and not isinstance(given, bool):

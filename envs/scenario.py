@@ -1,5 +1,6 @@
 """Schedule of a culture: phases, each with a setpoint and a temperature, maybe with a condition and other fluids."""
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -134,12 +135,13 @@ class Scenario(Phased):
         choices=("grow", "dilute"),
     )
     recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
-    announce_min: float | None = setting(
+    announce_min: float | str | None = setting(
         None,
-        "time by which controllers know a change of setpoint in advance; 0: never; null: 0, or what a further setpoint "
-        "brings",
+        "time by which controllers know a change of setpoint in advance; 0: never; auto: as long as half of the change "
+        "takes by the estimate; null: 0, or what a further setpoint brings",
         "min",
         within=(0, 1440),
+        words=("auto",),
     )
     until: tuple[str | None, ...] = setting(
         (),
@@ -186,8 +188,8 @@ class Scenario(Phased):
 
     @property
     def announced_min(self) -> float:
-        """Time by which a change is announced, min; 0: never."""
-        return 0.0 if self.announce_min is None else self.announce_min
+        """Time by which a change is announced, min; 0: never, inf: from the start of its step on."""
+        return math.inf if self.announce_min == "auto" else float(self.announce_min or 0.0)
 
     @property
     def supplied(self) -> frozenset[int]:

@@ -43,7 +43,7 @@ class Ratios:
         if composed(scenario):
             why = "[] where a share is asked for, whose controller plans by the minutes"
             require(not any(scenario.until), "scenario.until", scenario.until, why)
-            if scenario.announce_min is None:
+            if scenario.announce_min in (None, "auto"):
                 object.__setattr__(self, "announce_min", ANNOUNCED_MIN)
         scenario.one_each("ratios")
         if self.ratio_sine:

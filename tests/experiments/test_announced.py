@@ -27,6 +27,7 @@ from hardware.safety.interlock import Interlock
 
 STEPS = Scenario((0.5, 0.8, 0.8, 0.3), (37.0, 41.0, 20.0, 30.0), (37.0,) * 4, announce_min=25.0)
 SHORT = Scenario((0.7, 0.4), (50.0, 10.0), (37.0, 30.0), announce_min=9.0)
+AUTO = replace(STEPS, announce_min="auto")
 
 
 def aim(law: Any, steps: list[tuple[float, float, float]], period_min: float) -> list[float]:
@@ -85,15 +86,15 @@ def test_the_estimator_beside_a_law_without_one_believes_what_that_of_a_law_with
 
 
 def test_a_change_is_known_as_long_ahead_as_the_scenario_says() -> None:
-    progress = Progress([STEPS, SHORT])
+    progress = Progress([STEPS, SHORT, AUTO])
     for minute in np.arange(0.0, 130.0, 0.5):
-        following, left = progress.following(np.full(2, minute))
-        for n, scenario in enumerate((STEPS, SHORT)):
+        following, left = progress.following(np.full(3, minute))
+        for n, scenario in enumerate((STEPS, SHORT, AUTO)):
             ahead = [(e, r) for e, r in zip(scenario.edges[1:-1], scenario.setpoints[1:], strict=True) if e > minute]
             known = ahead and ahead[0][0] - minute <= scenario.announced_min
             assert left[n] == (ahead[0][0] - minute if known else math.inf)
-            assert following[n] == (ahead[0][1] if known else progress.asked(np.full(2, minute))[1][n])
-    assert progress.following(np.full(2, np.nan))[1].tolist() == [math.inf] * 2, "in recovery"
+            assert following[n] == (ahead[0][1] if known else progress.asked(np.full(3, minute))[1][n])
+    assert progress.following(np.full(3, np.nan))[1].tolist() == [math.inf] * 3, "in recovery"
     progress = Progress([replace(STEPS, until=("od >= 0.9", None, None, None))])  # nobody knows when it ends
     assert progress.following(np.array([30.0]))[1].tolist() == [math.inf]
     assert progress.following(np.array([60.0]))[1].tolist() == [18.0]
@@ -103,10 +104,12 @@ def test_a_change_is_known_as_long_ahead_as_the_scenario_says() -> None:
     ("scenario", "told"),
     [
         (STEPS, True),
+        (AUTO, True),
         (replace(STEPS, announce_min=0.0), False),
         (replace(STEPS, announce_min=None), False),
         (replace(STEPS, setpoints=(0.5,) * 4), False),
         (replace(STEPS, announce_min=None, ratios=(0.3, 0.4, 0.5, None)), True),
+        (replace(AUTO, ratios=(0.3, 0.4, 0.5, None)), True),
     ],
 )
 def test_where_a_share_is_asked_for_changes_are_known_ahead_by_default(scenario: Scenario, told: bool) -> None:
@@ -140,7 +143,7 @@ def test_recording_and_windows_keep_the_setpoint_that_was_asked_for(
     monkeypatch.setattr(Interlock, "check", lambda *given: judged.append(float(given[3][0])) or check(*given))
     words = ["plant=nominal", "plant.start_od=0.5", "controller=inverse", "backend.reactors=[M0,M1]"]
     words += ["scenario.setpoints=[0.5,0.7]", "scenario.minutes=[20,9]", "scenario.temperatures=[37,37]"]
-    words += ["scenario.announce_min=40", "+each.M1.announce_min=0"]
+    words += ["scenario.announce_min=auto", "+each.M1.announce_min=0"]
     (tmp_path / "run").mkdir()
     run.deploy(main.config([*words, "fsync=false"]), tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

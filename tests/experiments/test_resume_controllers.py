@@ -19,6 +19,7 @@ from experiments.laws.base import Array, Controller, Mask
 from experiments.laws.density import estimators
 from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop, Step
+from experiments.loop.signals import AIM
 from experiments.record.recovery import load_state
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -31,8 +32,8 @@ pytestmark = pytest.mark.numeric
 
 NAMES = ("M0", "M1", "M2")
 KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold", "gain_scheduled", "inverse ekf", "dqn ekf")
-SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5, announce_min=30.0)
-LENGTH, CUT = 44, 26
+SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5, announce_min="auto")
+LENGTH, CUTS = 44, (19, 26)  # before and after an announced change of two of the vials
 HOLD = Scenario((0.5,), (600.0,), (37.0,))
 REQUESTS = {  # what a program is killed at -> whether the dose under way was given
     "/SetOutputTarget/Pump1/M0/": False,
@@ -71,16 +72,17 @@ def decisions(steps: list[Step]) -> list[list[float]]:
 
 
 def cut_and_continued(kind: str, folder: Path, forgets: bool = False) -> list[Step]:
-    """`LENGTH` steps of which the last ones are of another loop, which got the first one's state by way of its file."""
-    reactors = vials()
-    first = loop(kind, reactors)
-    steps = [first.step() for _ in range(CUT)]
-    files.write_json(folder / "state.json", {"journal_row": 0, **first.state()}, False, indent=None)
-    second, state = loop(kind, reactors), load_state(folder / "state.json")
-    if forgets:
-        state["controller"] = second.state()["controller"]
-    second.restore(state)
-    return steps + [second.step() for _ in range(LENGTH - CUT)]
+    """`LENGTH` steps; after each cut they are of another loop, which got the former one's state by way of its file."""
+    reactors, steps = vials(), list[Step]()
+    running = loop(kind, reactors)
+    for cut in CUTS:
+        steps += [running.step() for _ in range(cut - len(steps))]
+        files.write_json(folder / "state.json", {"journal_row": 0, **running.state()}, False, indent=None)
+        running, state = loop(kind, reactors), load_state(folder / "state.json")
+        if forgets:
+            state["controller"] = running.state()["controller"]
+        running.restore(state)
+    return steps + [running.step() for _ in range(LENGTH - len(steps))]
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +98,9 @@ def uninterrupted() -> dict[str, list[Step]]:
 def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind, uninterrupted, tmp_path):
     whole, continued = uninterrupted[kind], cut_and_continued(kind, tmp_path)
     assert decisions(continued) == decisions(whole)
-    assert len({rate for rates in decisions(whole[CUT:]) for rate in rates}) > (1 if kind == "threshold" else 3)
+    assert len({rate for rates in decisions(whole[CUTS[0] :]) for rate in rates}) > (1 if kind == "threshold" else 3)
     for one, other in zip(whole, continued, strict=True):
+        assert one.columns[AIM].tolist() == other.columns[AIM].tolist()
         for key, value in one.explanation.items():
             np.testing.assert_array_equal(value, other.explanation[key], key)
 
@@ -105,7 +108,7 @@ def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind, uninterrup
 @pytest.mark.parametrize("kind", KINDS)
 def test_without_its_memory_it_decides_something_else(kind, uninterrupted, tmp_path):
     cold = cut_and_continued(kind, tmp_path, forgets=True)
-    assert decisions(cold)[:CUT] == decisions(uninterrupted[kind])[:CUT]
+    assert decisions(cold)[: CUTS[0]] == decisions(uninterrupted[kind])[: CUTS[0]]
     assert decisions(cold) != decisions(uninterrupted[kind])
 
 
