@@ -16,11 +16,6 @@ from typing import ParamSpec, TypeVar
 from experiments.cli import extensions
 from experiments.cli.messages import PumpsBeingEnded
 
-__all__ = [
-    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "heard", "interrupts", "one_interrupt", "pausing",
-    "undisturbed", "unmasked",
-]  # fmt: skip
-
 P = ParamSpec("P")
 T = TypeVar("T")
 log = logging.getLogger(__name__)

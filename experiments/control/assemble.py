@@ -19,7 +19,6 @@ from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.cli.calibrated import read_env_file, read_plant_file
@@ -27,9 +26,8 @@ from experiments.cli.files import choices
 from experiments.control import messages
 from experiments.control.config import DeployConfig
 from experiments.control.guests import GUESTS
-from experiments.control.policies import WantedPolicy, admit, policy_check, run_policy
+from experiments.control.policies import WantedPolicy, policy_check, run_policy
 from experiments.laws import registry
-from experiments.laws.density.learned import settings
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.progress import Progress
@@ -43,8 +41,6 @@ from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.watch.opened import WatchedFamily
 from hardware.watched import WatchedInterlock
-
-__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +91,6 @@ class Setup:
 def completed(config: DeployConfig, folder: Path | None = None) -> DeployConfig:
     """Fill in what guests complete. Args: as of `Guest.completed`. Raises: UserError."""
     with frame.refusing(ValueError, ReactorError):
-        config.schedules()
         for guest in GUESTS:
             config = guest.completed(config, folder)
     return config
@@ -131,15 +126,10 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     wanted = policy = bounds = None
     if config.controller.kind == "dqn":
         asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
-        changes = config.controller.estimator
         stake = config.poor_regret_pct, family.at_stake, config.force_policy
-        wanted = WantedPolicy(config.policy, bench, model, changes, asked, *stake)
+        wanted = WantedPolicy(config.policy, bench, model, config.controller.estimator, asked, *stake)
     if wanted is not None and not config.preflight_only:
-        policy = run_policy(wanted, folder, resumed)
-        admit(policy, folder / "policy.npz", wanted, resumed)
-        with frame.refusing(ValueError):
-            own = settings(policy, changes)
-        bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
+        policy, bounds = run_policy(wanted, folder, resumed)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
         policy, bounds, further, config.fsync, *_named(config, family, folder),

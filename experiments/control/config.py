@@ -14,8 +14,6 @@ from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig"]
-
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
 

@@ -15,6 +15,7 @@ from dqn.policy import Policy
 from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification import certificate
+from experiments.certification.bounds import EstimateBounds
 from experiments.certification.certificate import Opinion
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
@@ -22,11 +23,6 @@ from experiments.control import messages
 from experiments.laws.density.learned import settings
 from hardware.family import Check
 from hardware.storage import atomic
-
-__all__ = [
-    "SHIPPED", "Training", "WantedPolicy", "admit", "find_policy", "keep", "load_policy", "policy_check", "readable",
-    "run_policy",
-]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -208,11 +204,11 @@ def policy_check(wanted: WantedPolicy) -> Check:
     return Check("policy", False, told, remedy, wanted.refuses)
 
 
-def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> Policy:
-    """Load the policy of a run; the run folder keeps a copy with its certificate, which a resumed run uses.
+def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> tuple[Policy, EstimateBounds | None]:
+    """Load the policy of a run and its bounds; the run folder keeps a copy with its certificate, for a resumed run.
 
     The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.
-    Raises: UserError as `load_policy`, and if the copy cannot be written.
+    Raises: UserError as `load_policy` and `admit`, and if the copy cannot be written.
     """
     kept = folder / "policy.npz"
     again = resumed and kept.is_file()
@@ -220,7 +216,15 @@ def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> Policy:
     policy = load_policy(str(source), wanted.bench.control_min, wanted.bench.max_rate)
     if not again:
         keep(policy, kept, certificate.beside(source))
-    return policy
+    admit(policy, kept, wanted, resumed)
+    return policy, bounds_of(policy, wanted.estimator, kept, wanted.model)
+
+
+def bounds_of(policy: Policy, changes: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
+    """Read the bounds of a policy's certificate. Args: changes: of its estimator. Raises: UserError for a wrong one."""
+    with frame.refusing(ValueError):
+        own = settings(policy, changes)
+    return certificate.bounds(policy, own, file, model)
 
 
 def keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
