@@ -189,12 +189,13 @@ def policy_check(wanted: WantedPolicy) -> Check:
     That no policy has been trained yet does not stop a look at the device.
     """
     try:
-        policy = load_policy(wanted.name, wanted.bench.control_min, wanted.bench.max_rate)
+        path = find_policy(wanted.name)
+        policy = load_policy(str(path), wanted.bench.control_min, wanted.bench.max_rate)
     except NoPolicyError as error:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
         return Check("policy", False, str(error), "give another policy=PATH")
-    found = _judged(policy, find_policy(wanted.name), wanted)
+    found = _judged(policy, path, wanted)
     told = "; ".join(found.refused + found.short)
     if not found.refused:
         said = str(Training.of(policy))
