@@ -127,8 +127,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     wanted = policy = bounds = None
     if config.controller.kind == "dqn":
         asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
-        stake = config.poor_regret_pct, family.at_stake, config.force_policy
-        wanted = WantedPolicy(config.policy, bench, model, config.controller.estimator, asked, *stake)
+        changes, stake = config.controller.estimator, (family.at_stake, config.force_policy)
+        wanted = WantedPolicy(config.policy, bench, model, changes, asked, *stake)
     if wanted is not None and not config.preflight_only:
         policy, bounds = run_policy(wanted, folder, resumed)
     return Setup(
