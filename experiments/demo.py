@@ -9,8 +9,6 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
@@ -48,16 +46,6 @@ def commands(folder: Path) -> list[list[str]]:
     ]  # fmt: skip
 
 
-@contextmanager
-def _held(numbers: Sequence[int]) -> Iterator[None]:
-    """Block signals briefly, so that none arrives between two handlers."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _run(arguments: list[str]) -> None:
     os.setsid()
     for number in stop.SIGNALS:
@@ -77,7 +65,7 @@ def step(arguments: list[str], signals: list[int]) -> int:
     Args: signals: received here and passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False
-    with _held(stop.SIGNALS):
+    with stop.blocked(*stop.SIGNALS):
         process.start()
     for module in OTHERS:
         import_module(module)

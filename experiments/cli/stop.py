@@ -39,6 +39,16 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> 
             signal.signal(number, old)
 
 
+@contextmanager
+def blocked(*numbers: int) -> Iterator[None]:
+    """Let these signals wait in this context, so that none arrives between two handlers."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Wait:
     """State of a stop: whether stops wait, the waiting signal, whether the last stop arrived, and the raised stop."""
 
@@ -225,11 +235,8 @@ class Workers(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Submit as to an executor. A new process inherits the blocked signals."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-        try:
+        with blocked(signal.SIGINT, signal.SIGHUP):
             return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
