@@ -91,17 +91,12 @@ class Signal(Protocol):
     every window. sees_light: whether it needs the fluorescence, which the device then measures.
     """
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def actuator(self) -> str: ...
+    name: str
+    actuator: str
+    sees_light: bool
 
     @property
     def columns(self) -> tuple[str, ...]: ...
-
-    @property
-    def sees_light(self) -> bool: ...
 
     def decide(self, sample: Sample) -> Array:
         """Watch a sample and decide on a command, (N,), in the unit of the actuator: mL/s, degC.
