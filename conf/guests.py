@@ -2,8 +2,6 @@
 
 import importlib
 
-__all__ = ["GUESTS", "load"]
-
 GUESTS = {
     "envs": ("envs.coculture.guest",),
     "experiments": ("experiments.coculture.guest",),

@@ -12,8 +12,6 @@ from functools import partial
 from string import Formatter
 from typing import Any, ClassVar, Self
 
-__all__ = ["Message", "NameTaken", "NoSuchKey", "NotAllowed", "names"]
-
 
 def names(kind: "type[Message]") -> set[str]:
     """Names of the values in a message's sentence and remedy."""

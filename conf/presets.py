@@ -12,11 +12,6 @@ import yaml  # type: ignore[import-untyped]
 
 from conf.messages import NameTaken, NotAllowed
 
-__all__ = [
-    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owners", "place",
-    "program", "sentence",
-]  # fmt: skip
-
 ROOT = Path(str(resources.files("conf")))
 
 
@@ -119,21 +114,19 @@ def owners(name: str) -> tuple[str, ...]:
 
     Args: name: group and option, "experiment/paper".
     """
-    if name in _added:
-        return ()
-    found = re.search(r"^# @command ([\w,]+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
-    return tuple(found[1].split(",")) if found else ()
+    found = _directive(name, "command")
+    return tuple(found.split(",")) if found else ()
 
 
 def companion(name: str) -> str | None:
-    """Return the preset of another group that belongs to this one, `agent=relative` (line `# @with ...`).
+    """Return the preset of another group that belongs to this one, `agent=relative` (line `# @with ...`)."""
+    return _directive(name, "with")
 
-    Args: name: group and option, "env/relative".
-    """
-    path = ROOT / f"{name}.yaml"
-    if not path.is_file():  # null, or a file of the user's own
-        return None
-    found = re.search(r"^# @with ([\w/]+=\w+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+
+def _directive(name: str, word: str) -> str | None:
+    path = ROOT / f"{name}.yaml"  # none of null, of an added preset, or of a file of the user's own
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    found = re.search(rf"^# @{word} (\S+)$", text, re.MULTILINE)
     return found[1] if found else None
 
 

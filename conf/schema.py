@@ -16,8 +16,6 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 from conf.messages import NoSuchKey, NotAllowed
 
-__all__ = ["Entry", "add", "build", "check", "entries", "part", "require", "setting"]
-
 T = TypeVar("T")
 
 ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # for all parts (envs/bench.py)
@@ -165,7 +163,6 @@ def add(to: type[Any], more: type[Any]) -> None:
 
 
 def _said(f: Any) -> dict[str, Any]:
-    """Arguments of `field` that declare a field once more."""
     given = {"default": f.default, "default_factory": f.default_factory}
     return {"metadata": f.metadata, **{key: value for key, value in given.items() if value is not MISSING}}
 
@@ -214,7 +211,6 @@ class _NoSuchKey(Exception):
 
 
 def _keys(config: Any, prefix: str) -> Iterator[str]:
-    """List every key below a config dataclass, in full."""
     for f in fields(config):
         key, value = f"{prefix}.{f.name}" if prefix else f.name, getattr(config, f.name)
         yield key

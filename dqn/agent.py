@@ -15,8 +15,6 @@ from dqn.replay import Array, Replay, Transition
 from dqn.streams import UniformStream
 from dqn.targets import advantage_target, compressed, expanded, huber_loss, loss_gradient, q_target
 
-__all__ = ["STREAMS", "DQNAgent"]
-
 STREAMS = ("init", "explore", "replay", "hindsight")
 """Names of the random streams an agent needs, each independent of the others."""
 
@@ -86,7 +84,6 @@ class DQNAgent:
 
     @property
     def epsilon(self) -> float:
-        """Exploration rate now."""
         return self.config.epsilon(self.steps)
 
     def act(self, observation: Array) -> NDArray[np.int64]:
@@ -138,7 +135,6 @@ class DQNAgent:
         return self.target.forward(features.view(agents, n * b, f))[0].view(agents, n, b, self.n_actions)
 
     def _td_target(self, batch: Transition) -> torch.Tensor:
-        """Compute the target y of every transition, shape (S, n, B)."""
         c = self.config
         q_t = self._q_target(batch.s_t)
         if c.value_root:

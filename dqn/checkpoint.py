@@ -6,8 +6,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["CheckpointError", "load", "save"]
-
 FORMAT = 5
 
 

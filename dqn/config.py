@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 from conf.schema import check, setting
 
-__all__ = ["DQNConfig"]
-
 
 @dataclass(frozen=True)
 class DQNConfig:

@@ -9,8 +9,6 @@ import torch
 from dqn.config import DQNConfig
 from dqn.replay import Transition
 
-__all__ = ["GoalRelabel", "ProgramRelabel", "Relabel", "ShiftRelabel"]
-
 
 class Relabel(Protocol):
     """New goals for the transitions of a minibatch, in two steps; the first needs only random numbers.

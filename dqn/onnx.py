@@ -9,8 +9,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from dqn.policy import Policy
 
-__all__ = ["write"]
-
 
 def write(policy: Policy, path: Path) -> None:
     """Write the network, (N, O) float32 `observation` -> (N, A) float32 `q`; the greedy action is its argmax.

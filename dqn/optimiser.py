@@ -2,8 +2,6 @@
 
 import torch
 
-__all__ = ["Adam"]
-
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 """Constants of Adam as published (Kingma & Ba 2015, Algorithm 1)."""
 
@@ -24,7 +22,6 @@ class Adam:
         self._steps = torch.zeros((), device=weights.device)
 
     def step(self, learning_rate: float) -> None:
-        """Take one step along the gradient."""
         self._steps += 1
         torch._fused_adam_(
             [self._weights], [self._gradient], [self._mean], [self._square], [], [self._steps],
@@ -33,11 +30,9 @@ class Adam:
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Everything needed to continue."""
         return {"mean": self._mean.cpu(), "square": self._square.cpu(), "steps": self._steps.cpu()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Continue as saved."""
         self._mean.copy_(state["mean"])
         self._square.copy_(state["square"])
         self._steps.copy_(state["steps"])

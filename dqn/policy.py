@@ -22,10 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "ABSOLUTE", "FORMAT", "PREVIEW", "RELATIVE", "Policy", "PolicyError", "add", "fingerprints", "load", "save",
-]  # fmt: skip
-
 FORMAT = 2
 ABSOLUTE = ("od", "setpoint")
 PREVIEW = (*ABSOLUTE, "next_setpoint", "minutes_to_change")
@@ -83,29 +79,25 @@ class Policy:
         return self.actions[self.act(observation)]
 
 
+STORED = {"observation_low": "low", "observation_high": "high"} | {
+    name: name for name in ("input_matrix", "input_offset", "actions")
+}
+"""Array of a policy file, except those of the layers -> field of `Policy`."""
+
+
 def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
-    """Return all arrays of a policy file except its metadata, by name."""
-    arrays: dict[str, NDArray[Any]] = {
-        "input_matrix": policy.input_matrix,
-        "input_offset": policy.input_offset,
-        "actions": policy.actions,
-        "observation_low": policy.low,
-        "observation_high": policy.high,
-    }
-    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        arrays[f"w{k}"], arrays[f"b{k}"] = weight, bias
-    return arrays
+    layers = {"w": policy.weights, "b": policy.biases}
+    found: dict[str, NDArray[Any]] = {name: getattr(policy, field) for name, field in STORED.items()}
+    return found | {f"{key}{k}": array for key, arrays in layers.items() for k, array in enumerate(arrays)}
 
 
 def fingerprints(policy: Policy) -> dict[str, str]:
     """Return the SHA-256 of each array that determines the chosen action or its meaning, by name."""
     said = {key: policy.metadata.get(key) for key in ("observation", "control_min", "model")}
-    arrays = _arrays(policy)
-    limits = ("observation_low", "observation_high")
-    weights = [name for name in arrays if name not in ("input_matrix", "input_offset", "actions", *limits)]
+    arrays, limits = _arrays(policy), ("observation_low", "observation_high")
     parts = {"map of the inputs": ("input_matrix", "input_offset"), "actions": ("actions",), "limits": limits}
     found = {"observation or model": hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()}
-    for part, names in {"weights": sorted(weights), **parts}.items():
+    for part, names in {"weights": sorted(arrays.keys() - STORED), **parts}.items():
         digest = hashlib.sha256()
         for name in names:
             digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
@@ -145,17 +137,9 @@ def load(path: Path) -> Policy:
         if tuple(metadata.get("observation", ())) not in _known:
             allowed = " or ".join(str(list(names)) for names in _known)
             raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
-        layers = sum(name.startswith("w") for name in arrays)
-        policy = Policy(
-            weights=tuple(arrays[f"w{k}"] for k in range(layers)),
-            biases=tuple(arrays[f"b{k}"] for k in range(layers)),
-            input_matrix=arrays["input_matrix"],
-            input_offset=arrays["input_offset"],
-            actions=arrays["actions"],
-            low=arrays["observation_low"],
-            high=arrays["observation_high"],
-            metadata=metadata,
-        )
+        layers = range(sum(name.startswith("w") for name in arrays))
+        weights, biases = (tuple(arrays[f"{key}{k}"] for k in layers) for key in "wb")
+        policy = Policy(weights, biases, metadata=metadata, **{f: arrays[name] for name, f in STORED.items()})
         q = policy.q_values(np.full((1, len(metadata["observation"])), 0.5))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise PolicyError(f"policy {path}: incomplete or of mismatched shapes ({error}); {remedy}") from None

@@ -10,8 +10,6 @@ import torch
 from dqn.network import QNetwork
 from dqn.trainer import Trainer, TrainRecord
 
-__all__ = ["GROUP", "Population", "fast_arithmetic"]
-
 GROUP = 16
 """Agents per group on a CPU: enough to make the overhead of calling torch small, few enough for the CPU's caches."""
 
@@ -48,12 +46,10 @@ class Population:
 
     @property
     def steps(self) -> int:
-        """Environment steps taken by every agent."""
         return self.groups[0].agent.steps
 
     @property
     def updates(self) -> int:
-        """Gradient steps taken by every agent."""
         return self.groups[0].agent.updates
 
     @property
@@ -76,10 +72,8 @@ class Population:
                 yield TrainRecord.joined(records)
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state of all groups."""
         return {"groups": [group.state_dict() for group in self.groups]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         for group, saved in zip(self.groups, state["groups"], strict=True):
             group.load_state_dict(saved)

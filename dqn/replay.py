@@ -6,9 +6,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["Replay", "Transition"]
-
-
 Array = NDArray[Any]
 
 
@@ -78,10 +75,8 @@ class Replay:
         return Transition(s_tm1, a_tm1.squeeze(-1).long(), r_t.squeeze(-1), s_t, continues.squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue."""
         return {"rows": self._rows[:, : self.size].cpu(), "added": self.added}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         self.added = state["added"]
         self._rows[:, : self.size] = state["rows"].to(self._rows.device)

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UniformStream"]
-
 CALLS_PER_BLOCK = 128
 
 
@@ -56,7 +54,6 @@ class UniformStream:
         return {"generators": states, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         for generator, stored in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = stored
         if state["position"] < CALLS_PER_BLOCK:

@@ -2,8 +2,6 @@
 
 import torch
 
-__all__ = ["advantage_target", "compressed", "expanded", "huber_loss", "loss_gradient", "q_target"]
-
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
     """Compute y = r + gamma c max_a Q_target(s', a) (Mnih 2015).

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from dqn.network import QNetwork
 
-__all__ = ["Agent", "TrainRecord", "Trainer", "TrainingEnv"]
-
 Array = NDArray[np.float64]
 Curves = Mapping[str, Array | float]
 
@@ -129,7 +127,6 @@ class Trainer:
 
     @torch.inference_mode()  # gradients are computed by hand, so torch needs no graph
     def _until(self, step: int) -> None:
-        """Train up to an environment step."""
         while self.agent.steps < step:
             self._step()
 
@@ -155,7 +152,6 @@ class Trainer:
         return TrainRecord(agent.steps, agent.updates, self._finished.copy(), agent.curves())
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state of agents, environment and loop."""
         return {
             "agent": self.agent.state_dict(),
             "env": self.env.state_dict(),
@@ -164,7 +160,6 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         self.agent.load_state_dict(state["agent"])
         self._observation = self.env.load_state_dict(state["env"])
         self._return[:] = state["return"]

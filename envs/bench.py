@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 
-__all__ = ["VIAL_ML", "Bench"]
-
 VIAL_ML = 30.0
 """Volume of a Chi.Bio vial up to its rim, mL (docs/biology.md, Volume)."""
 

@@ -5,8 +5,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["INTEGRATORS", "Integrator", "euler", "rk4"]
-
 Array = NDArray[np.float64]
 Derivative = Callable[[Array], Array]
 Integrator = Callable[[Derivative, Array, float, int], Array]

@@ -8,54 +8,53 @@ squared errors over the remaining k steps. Backward induction (Bellman 1957), k 
 learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.integrators import Array
 from envs.relative import RelativeConfig
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
 
-__all__ = ["EpisodeOptimum", "OptimalPolicy", "RelativeOptimum", "solve", "solve_episode", "solve_relative"]
-
-Array = NDArray[np.float64]
 SPACING = 4.7e-4  # of log OD: eight points per action of the nominal model
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeOptimum:
-    """Optimal controller of setpoints that are known ahead, for as many steps.
+    """Optimal controller of targets that are known ahead, for as many steps.
 
-    setpoint: s of each step, OD, shape (K,). log_od: uniform grid of log OD, shape (G,).
-    factors: x(t+1) = factors[a] x(t), shape (A,).
-    value: V_k, the least sum of (x - s)^2 over the last k steps, each taken after the step, shape (K + 1, G).
+    target: of each step, (K,). grid: uniform, (G,). value: V_k, the least sum of squared distances from the targets in
+    the last k steps, each taken after the step, (K + 1, G).
+    after: from states (N,) to those after each action, (N, A). place: from states to their places on the grid.
     """
 
-    setpoint: Array
-    log_od: Array
-    factors: Array
+    target: Array
+    grid: Array
     value: Array
+    after: Callable[[Array], Array]
+    place: Callable[[Array], Array]
 
-    def act(self, od: Array, left: int) -> NDArray[np.intp]:
+    def act(self, state: Array, left: int) -> NDArray[np.intp]:
         """Return the best action with `left` remaining steps, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
-        after = np.minimum(np.maximum(od, 1e-6)[:, None] * self.factors, MAX_OD)
-        ahead = np.interp(np.log(np.maximum(after, 1e-12)), self.log_od, self.value[left - 1])
-        return np.asarray(np.argmin((after - self.setpoint[-left]) ** 2 + ahead, axis=1), dtype=np.intp)
+        after = self.after(state)
+        ahead = np.interp(self.place(after), self.grid, self.value[left - 1])
+        return np.asarray(np.argmin((after - self.target[-left]) ** 2 + ahead, axis=1), dtype=np.intp)
 
-    def rollout(self, od: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Run K steps from the starts `od`, shape (N,); return the OD after each step and the action, each (K, N)."""
-        steps = self.value.shape[0] - 1
-        ods, actions = np.empty((steps, od.size)), np.empty((steps, od.size), dtype=np.intp)
-        for k in range(steps):
-            actions[k] = self.act(od, steps - k)
-            ods[k] = od = np.minimum(od * self.factors[actions[k]], MAX_OD)
-        return ods, actions
+    def rollout(self, state: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Run K steps from the starts, shape (N,); return the state after each step and the action, each (K, N)."""
+        shape, rows = (self.target.size, state.size), np.arange(state.size)
+        states, actions = np.empty(shape), np.empty(shape, dtype=np.intp)
+        for k in range(self.target.size):
+            actions[k] = self.act(state, self.target.size - k)
+            states[k] = state = self.after(state)[rows, actions[k]]
+        return states, actions
 
 
 def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = SPACING) -> EpisodeOptimum:
-    """Solve an episode for its least undiscounted cost.
+    """Solve an episode for its least undiscounted cost; states are ODs.
 
     Args: config: the task; with its actions and integrator. setpoint: OD, of all `config.episode_steps` steps or of
       each of them, (K,). spacing: of log OD.
@@ -64,7 +63,11 @@ def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = S
     log_od = _reach(config, program, factors, spacing)
     shift = np.log(np.maximum(factors, 1e-12)) / (log_od[1] - log_od[0])
     after = np.minimum(np.exp(log_od) * factors[:, None], MAX_OD)
-    return EpisodeOptimum(program, log_od, factors, _backward([(after - s) ** 2 for s in program[::-1]], shift))
+    value = _backward([(after - s) ** 2 for s in program[::-1]], shift)
+    return EpisodeOptimum(
+        program, log_od, value, lambda od: np.minimum(np.maximum(od, 1e-6)[:, None] * factors, MAX_OD),
+        lambda od: np.log(np.maximum(od, 1e-12)),
+    )  # fmt: skip
 
 
 def _backward(stages: Sequence[Array], shift: Array) -> Array:
@@ -88,43 +91,14 @@ def _backward(stages: Sequence[Array], shift: Array) -> Array:
     return value
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeOptimum:
-    """Optimal controller of e' = e + s - v (`envs/relative.py`) at one growth share for a known number of steps.
-
-    growth_share: s. error: uniform grid of e, (G,). levels: v, (A,). value: V_k, least sum of e^2, (K + 1, G).
-    """
-
-    growth_share: float
-    error: Array
-    levels: Array
-    value: Array
-
-    def act(self, error: Array, left: int) -> NDArray[np.intp]:
-        """Return the best action with `left` remaining steps, by one exact look-ahead; (N,) -> (N,)."""
-        after = error[:, None] + self.growth_share - self.levels
-        return np.asarray(np.argmin(after**2 + np.interp(after, self.error, self.value[left - 1]), axis=1))
-
-    def rollout(self, error: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Run K steps from the starts, shape (N,); return the error after each step and the action, each (K, N)."""
-        steps = self.value.shape[0] - 1
-        errors, actions = np.empty((steps, error.size)), np.empty((steps, error.size), dtype=np.intp)
-        for k in range(steps):
-            actions[k] = self.act(error, steps - k)
-            errors[k] = error = error + self.growth_share - self.levels[actions[k]]
-        return errors, actions
-
-
-def solve_relative(
-    config: RelativeConfig, growth_share: float, steps: int, spacing: float = 1 / 256
-) -> RelativeOptimum:
-    """Minimise the sum of e^2 over `steps` steps at one growth share. Args: spacing: of the grid of e."""
+def solve_relative(config: RelativeConfig, growth_share: float, steps: int, spacing: float = 1 / 256) -> EpisodeOptimum:
+    """Minimise the sum of e^2 over `steps` steps at one growth share; states are errors. Args: spacing: of e."""
     levels = config.levels()
     reach = config.largest_error + 1.0
     error = np.linspace(-reach, reach, round(2.0 * reach / spacing) + 1)
     moved = growth_share - levels
     value = _backward([(error + moved[:, None]) ** 2] * steps, moved / (error[1] - error[0]))
-    return RelativeOptimum(growth_share, error, levels, value)
+    return EpisodeOptimum(np.zeros(steps), error, value, lambda e: e[:, None] + growth_share - levels, np.asarray)
 
 
 def _reach(config: EnvConfig, program: Array, factors: Array, spacing: float) -> Array:

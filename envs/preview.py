@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from conf.schema import require, setting
 from envs.gym_adapter import EpisodeEnv
+from envs.integrators import Array
 from envs.task import MAX_OD, EnvConfig
 from envs.vector_env import BioreactorVectorEnv
 
-__all__ = ["PreviewConfig", "PreviewEnv", "PreviewVectorEnv", "half_way", "minutes_ahead", "passed", "program_of"]
-
-Array = NDArray[np.float64]
 FAR = 1e6  # periods: where no change is known
 
 

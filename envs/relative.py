@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.gym_adapter import EpisodeEnv
+from envs.integrators import Array
 from envs.vector_env import EpisodeVectorEnv
-
-__all__ = ["RelativeConfig", "RelativeEnv", "RelativeVectorEnv", "nearest_level", "relative_reward"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,6 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 
-__all__ = [
-    "DOSE_ML", "HEATED", "MADE_UP_MIN", "PUMPS", "Conditions", "Output", "Phased", "Scenario", "bounds", "outputs_of",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

@@ -4,15 +4,10 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from conf.messages import NotAllowed
 from conf.schema import check, setting
-from envs.integrators import INTEGRATORS
+from envs.integrators import INTEGRATORS, Array
 
-__all__ = ["MAX_OD", "MAX_PUMP_RATE", "SCORED_OD", "EnvConfig", "pump_rates", "step_factors", "tracking_reward"]
-
-Array = NDArray[np.float64]
 T = TypeVar("T", bound=Any)
 
 MAX_PUMP_RATE = 0.02
@@ -23,18 +18,6 @@ MAX_OD = 1000.0
 
 SCORED_OD = (0.1, 1.1)
 """Range of the scored starts, independent of `start_od`."""
-
-
-def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
-    """Return n pump rates in mL/s, equally spaced from 0 to `maximum`, shape (n,).
-
-    Raises: ValueError if n < 2 or `maximum` is not positive.
-    """
-    if n < 2:
-        raise NotAllowed(key="number of pump rates", given=n, allowed=">= 2 (the pump must be able to stop and to run)")
-    if not maximum > 0.0:
-        raise ValueError(f"maximum pump rate = {maximum} mL/s: allowed > 0")
-    return np.linspace(0.0, maximum, n)
 
 
 @dataclass(frozen=True)
@@ -89,7 +72,7 @@ class EnvConfig:
 
     def pump_rates(self) -> Array:
         """Return the action grid in mL/s, shape (A,)."""
-        return pump_rates(self.n_actions, self.max_pump_rate)
+        return np.linspace(0.0, self.max_pump_rate, self.n_actions)
 
 
 def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:

@@ -4,7 +4,7 @@ import reprlib
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from gymnasium import logger, spaces
@@ -14,11 +14,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from conf.schema import build, require
+from envs.integrators import Array
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
-__all__ = ["BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "EpisodeVectorEnv", "checked_actions"]
-
-Array = NDArray[np.float64]
 C = TypeVar("C", bound=Any)  # the task's config dataclass
 EPISODES_PER_BLOCK = 64
 
@@ -91,7 +89,6 @@ class EpisodeStreams:
         return {"generators": list(self._states), "position": self._position.tolist()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         for generator, stored in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = stored
         self._refill(np.arange(len(self._generators)))
@@ -180,12 +177,18 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """Return the rewards of the last steps of episodes, (K,)."""
         return last
 
+    @classmethod
+    def seeded(cls, config: C, seeds: Sequence[np.random.SeedSequence]) -> Self:
+        """Make one copy per seed."""
+        env = cls(len(seeds), config)
+        env.seed_streams(seeds)
+        return env
+
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
         self._streams = EpisodeStreams(seeds, self.numbers)
 
     def _start(self, copies: NDArray[np.intp]) -> None:
-        """Begin a new episode in `copies`."""
         assert self._streams is not None
         self.state[copies] = self._begun(self._streams.take(copies))
         self._steps[copies] = 0
@@ -216,26 +219,21 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}: allowed ({self.num_envs},)")
-        starts = {self._column(name): self._checked(name, value) for name, value in given.items()}
+        starts = dict(self._given(name, value) for name, value in given.items())
         self._start(np.flatnonzero(mask))
         for column, value in starts.items():
             self.state[mask, column] = value[mask]
         return self._observe(), {}
 
-    def _column(self, name: str) -> int:
-        """Return the column of a named number of the observation. Raises: ValueError."""
-        names = self.names[: self.state.shape[1]]
+    def _given(self, name: str, value: Any) -> tuple[int, Array]:
+        """Return column and values (N,) of a start given to a reset. Raises: ValueError."""
+        space, names = self.observations(self.config), self.names[: self.state.shape[1]]
         require(name in names, "reset option", name, ", ".join(("reset_mask", *names)))
-        return names.index(name)
-
-    def _checked(self, name: str, value: Any) -> Array:
-        """Check a start given to a reset, (N,). Raises: ValueError."""
-        space, column = self.observations(self.config), self._column(name)
-        low, high = float(space.low[column]), float(space.high[column])
+        low, high = float(space.low[names.index(name)]), float(space.high[names.index(name)])
         given = np.asarray(value, dtype=np.float64)
         fits = given.shape in ((), (self.num_envs,)) and bool(np.all((low <= given) & (given <= high)))
         require(fits, name, reprlib.repr(given.tolist()), f"{low:g} to {high:g}, one number or {self.num_envs}")
-        return np.broadcast_to(given, (self.num_envs,))
+        return names.index(name), np.broadcast_to(given, (self.num_envs,))
 
     def step(
         self, actions: NDArray[np.intp]
@@ -288,7 +286,6 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
-        """Continue as saved; returns the current observations (N, O)."""
         assert self._streams is not None, "seed_streams before load_state_dict"
         self.state[:] = state["state"]
         self._steps[:] = state["steps"]

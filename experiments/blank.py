@@ -15,8 +15,6 @@ from hardware.chibio.procedures import measure_blanks, warm_up
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.errors import ReactorError
 
-__all__ = ["BlankConfig", "blank"]
-
 log = logging.getLogger(__name__)
 
 

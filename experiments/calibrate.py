@@ -15,14 +15,12 @@ from envs.identification.screening import Series, merged
 from envs.identification.twin import Twin, twin
 from envs.identification.verdict import Calibration
 from experiments.calibration.config import CalibrateConfig
-from experiments.calibration.result import environment_yaml, refusal, report, summary
+from experiments.calibration.result import environment_yaml, refusal, summary, twin_yaml
 from experiments.calibration.study import coverage, simulated
-from experiments.calibration.twin_file import twin_yaml
 from experiments.cli import files, frame
+from experiments.reporting.verdict import verdict
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
-
-__all__ = ["body", "main"]
 
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")
 
@@ -72,8 +70,12 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     behind = twin(raw, result, config.identify.segment_min)
     written = _write_twin(folder / "twin.yaml", behind, name)
     _draw(folder, raw, result, behind, name, config.identify.segment_min)
-    print(report(result, recording, content))
-    print(f"\n  files       {environment}\n              {written}\n              {folder}/{{summary.json, figures/}}")
+    if told := verdict(content, {"data": config.data}):
+        print("\n".join(["", told.claim, *(f"  {item}" for item in told.items), told.remark]))
+    for what in content["rejected"]:
+        print(f"  rejected rows {what['rows']} ({what['n']}): {what['reason']}")
+    print("\n".join(f"  {note}" for note in recording.notes), f"files {environment}, {written}", sep="\n")
+    print(f"next, all of it on one page: python -m experiments.report run={folder}")
     return result.pmse_pct
 
 
@@ -88,7 +90,6 @@ def _write_twin(path: Path, behind: Twin, source: str) -> str:
 
 
 def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: str, segment_min: float) -> None:
-    """Draw figures, as files and for TensorBoard, and write its scalars."""
     from experiments.reporting.calibration_charts import drift_figure, fit_figure, twin_figure
     from experiments.reporting.charts import save
     from experiments.reporting.tensorboard import Events

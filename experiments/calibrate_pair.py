@@ -23,8 +23,6 @@ from hardware.errors import RecordingError
 from hardware.storage.atomic import write
 from hardware.storage.marks import read_marks
 
-__all__ = ["CalibratePairConfig", "calibrate_pair", "main"]
-
 log = logging.getLogger(__name__)
 
 FEWEST = 3  # temperatures of a curve
@@ -95,7 +93,6 @@ def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfi
 
 
 def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibratePairConfig) -> Polynomial:
-    """Fit the growth curve of a species. Raises: UserError for too few temperatures."""
     t = np.array([p.temperature for p in points])
     apart = np.unique(np.round(t)).size
     if apart < FEWEST:

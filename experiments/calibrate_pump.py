@@ -24,8 +24,6 @@ from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE, Permitted
 from hardware.errors import ReactorError
 from hardware.logbook import no_log
 
-__all__ = ["CalibratePumpConfig", "Weighing", "calibrate", "read_weighings"]
-
 log = logging.getLogger(__name__)
 
 PUMP_OF = {"feed": FEED, "waste": WASTE}

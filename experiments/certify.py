@@ -21,8 +21,6 @@ from experiments.control.policies import SHIPPED, find_policy
 from experiments.laws.density.learned import settings
 from experiments.reporting.verdict import REMEDY
 
-__all__ = ["main"]
-
 log = logging.getLogger(__name__)
 
 
@@ -107,7 +105,6 @@ def _place(config: CertifyConfig, source: Path) -> Path | None:
 
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
-    """Build the summary: the verdict, every requirement, and a row per case."""
     kept = ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
     cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
     heads = (*content["observation"][:2], "from action", "to action")

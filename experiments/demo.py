@@ -9,15 +9,11 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
 from experiments.cli import stop
-
-__all__ = ["main"]
+from experiments.cli.sweep import fresh
 
 FIRST = ("matplotlib.pyplot", "scipy.optimize", "experiments.calibrate")  # imports of the first command
 OTHERS = (
@@ -38,7 +34,7 @@ def commands(folder: Path) -> list[list[str]]:
     """Return the steps: the name of each command and its overrides, each with its own folder below `folder`."""
     calibrated = folder / "1_calibrate" / "calibrated.yaml"
     policy = folder / "2_train" / "policy.npz"
-    steps = [  # seed 3 is within the limits after 1,800 steps; others need up to 10,000
+    return [  # seed 3 is within the limits after 1,800 steps; others need up to 10,000
         ["calibrate", f"hydra.run.dir={folder / '1_calibrate'}"],
         ["train", f"env_file={calibrated}", "stop_within=1", "seed=3", f"hydra.run.dir={folder / '2_train'}"],
         ["certify", f"policy={policy}", f"hydra.run.dir={folder / '3_certify'}"],
@@ -48,21 +44,9 @@ def commands(folder: Path) -> list[list[str]]:
         ],
         ["report", f"run={folder}", f"hydra.run.dir={folder / '5_report'}"],
     ]  # fmt: skip
-    return steps
-
-
-@contextmanager
-def _held(numbers: Sequence[int]) -> Iterator[None]:
-    """Block signals briefly, so that none arrives between two handlers."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(arguments: list[str]) -> None:
-    """Run one command in this process, in its own session."""
     os.setsid()
     for number in stop.SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -81,7 +65,7 @@ def step(arguments: list[str], signals: list[int]) -> int:
     Args: signals: received here and passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False
-    with _held(stop.SIGNALS):
+    with stop.blocked(*stop.SIGNALS):
         process.start()
     for module in OTHERS:
         import_module(module)
@@ -102,7 +86,7 @@ def main() -> None:
         text = f"error: {others[0]}: the demo accepts only --help; give values to calibrate, train and deploy"
         print(text, file=sys.stderr)
         sys.exit(1)
-    folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # unique for each demo
+    folder = fresh("demo")
     print(PLAN.format(folder=folder), flush=True)
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):

@@ -16,8 +16,6 @@ from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
 
-__all__ = ["MarkConfig", "main", "mark"]
-
 LONGEST = 80  # characters of a text
 USUAL_SD = 0.03
 
@@ -68,7 +66,6 @@ class MarkConfig:
 
 
 def _minute_now(folder: Path, stored: Any) -> float:
-    """Return the current minute of a run. Raises: UserError if it is over or has not begun."""
     from hardware.clock import run_time
     from hardware.family import family, known  # and with it the plant, only for this
 
@@ -86,7 +83,6 @@ def _minute_now(folder: Path, stored: Any) -> float:
 
 
 def _latest(folder: Path, stored: Any) -> float:
-    """Return the latest minute of a run."""
     try:
         return _minute_now(folder, stored)
     except frame.UserError:
@@ -124,7 +120,6 @@ def mark(config: MarkConfig) -> str:
 
 
 def _quoted(argument: str) -> str:
-    """Return a text as typed, quoted for Hydra's grammar."""
     key, _, value = argument.partition("=")
     if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
         return argument

@@ -17,14 +17,12 @@ from envs.identification.twin import twin
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.calibration.twin_file import plant_of
-from experiments.certification import certificate
+from experiments.calibration.result import plant_of
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
-from experiments.control.policies import find_policy, load_policy
+from experiments.control.policies import bounds_of, find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Array, Controller
-from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop
 from experiments.replays.config import ReplayConfig
 from experiments.replays.replay import AHEAD, Replayed, replay
@@ -32,8 +30,6 @@ from hardware.errors import RecordingError
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.watched import WatchedInterlock
-
-__all__ = ["body", "main"]
 
 log = logging.getLogger(__name__)
 
@@ -103,14 +99,12 @@ def _usual(series: Series) -> float:
 
 
 def _law(config: ReplayConfig, model: EnvConfig) -> Callable[[], Controller]:
-    """Return what makes the controller. Raises: frame.UserError for one that knows a plant, or for no policy."""
     policy = bounds = None
     with frame.refusing(ValueError):
         registry.on_device(config.controller.kind)
         if config.controller.kind == "dqn":
             policy = load_policy(config.policy, model.control_min, config.bench.max_rate)
-            own = settings(policy, config.controller.estimator)
-            bounds = certificate.bounds(policy, own, find_policy(config.policy), model)
+            bounds = bounds_of(policy, config.controller.estimator, find_policy(config.policy), model)
     volume_ml = config.bench.volume_ml
     return lambda: registry.build(config.controller, model=model, policy=policy, bounds=bounds, volume_ml=volume_ml)
 

@@ -16,8 +16,6 @@ from conf.schema import setting
 from experiments.cli import files, frame, sweep, words
 from experiments.reporting.sweep_results import Result
 
-__all__ = ["ReportConfig", "compare", "find", "main", "write"]
-
 log = logging.getLogger(__name__)
 
 
@@ -30,7 +28,6 @@ class ReportConfig:
 
 
 def _summary(run: Path) -> Any:
-    """Read a run's summary. Raises: frame.UserError for a file without valid JSON."""
     try:
         summary = json.loads((run / "summary.json").read_text("utf-8"))
         json.dumps(summary, ensure_ascii=False).encode()

@@ -24,8 +24,6 @@ from experiments.training import tasks
 from experiments.training.config import env_schema
 from experiments.training.evaluation import Evaluation
 
-__all__ = ["Function", "ScoreConfig", "score"]
-
 log = logging.getLogger(__name__)
 
 
@@ -53,7 +51,6 @@ class Function:
     actions: NDArray[np.float64]
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.intp]:
-        """Choose an action for each row. Raises: ValueError unless the function returns one valid index for each."""
         return checked_actions(self.call(observation.astype(np.float32)), observation.shape[:1], self.actions.size)
 
     def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
@@ -62,7 +59,6 @@ class Function:
 
 
 def _found(name: str, task: tasks.Task) -> Any:
-    """Load the scored policy or function. Raises: frame.UserError."""
     remedy = "give a policy.npz, or module:function of a Python file in this folder"
     if not name:
         raise frame.UserError(f"policy = '': nothing to score; {remedy}")
@@ -121,7 +117,6 @@ def score(config: ScoreConfig, folder: Path) -> float:
 
 
 def _write_onnx(policy: Any, to: Path) -> None:
-    """Write the network. Raises: frame.UserError."""
     if isinstance(policy, Function):
         raise frame.UserError(f"onnx={to}: a function has no network; give policy=FILE.npz")
     try:

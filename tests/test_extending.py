@@ -101,10 +101,10 @@ from pathlib import Path
 import numpy as np, torch
 from dqn import checkpoint
 from envs.task import EnvConfig
-from experiments.training import build, tasks
-build.GROUP, task = 2, tasks.of(EnvConfig(episode_steps=30))
+from experiments.training import agents, tasks
+agents.GROUP, task = 2, tasks.of(EnvConfig(episode_steps=30))
 agent = runpy.run_path("ppo.py")["PpoConfig"](total_steps=130, horizon=41)
-whole, again = (build.population(task, agent, (3, 4, 9)) for _ in range(2))
+whole, again = (agents.population(task, agent, (3, 4, 9)) for _ in range(2))
 start, records = whole.weights(), []
 for record in whole.run():
     records.append(record)

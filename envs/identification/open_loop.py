@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.task import MAX_PUMP_RATE, pump_rates
+from envs.task import MAX_PUMP_RATE, EnvConfig
 
 __all__ = ["Decide", "OpenLoop", "OpenLoopLaw", "open_loop", "recordings"]
 
@@ -110,7 +110,7 @@ class OpenLoopLaw:
 
     def __init__(self, config: OpenLoop, n: int, rng: np.random.Generator) -> None:
         self.config, self.rng = config, rng
-        self.rates = pump_rates()
+        self.rates = EnvConfig().pump_rates()
         self.diluted = np.zeros(n, dtype=np.bool_)
         self.rate = np.zeros(n)
         self.until = np.zeros(n)

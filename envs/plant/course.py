@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from conf.schema import require
 
-__all__ = ["along", "check_knots"]
-
 Array = NDArray[np.float64]
 
 

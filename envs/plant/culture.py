@@ -5,16 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.integrators import Integrator
+from envs.integrators import Array, Integrator
 from envs.plant.course import along, check_knots
 from envs.plant.strains import TEMPERATURE_LAWS, Strain
-
-__all__ = ["Culture", "GrowthConfig"]
-
-Array = NDArray[np.float64]
 
 SETTLED_FRACTION = 0.08  # fraction of the OD lost from the light path without stirring (docs/biology.md, Stirring)
 SETTLING_MIN = 1.5  # min, for a loss within about three readings (docs/biology.md, Stirring)
@@ -109,12 +104,10 @@ class Culture:
 
     @property
     def od(self) -> Array:
-        """True suspended biomass of all strains, OD, shape (N,)."""
         return np.asarray(self.biomass.sum(axis=1))
 
     @property
     def wall(self) -> Array:
-        """Biomass of all strains on the wall, OD-equivalent, shape (N,)."""
         return np.asarray(self._wall.sum(axis=1))
 
     @property

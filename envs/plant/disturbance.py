@@ -5,8 +5,6 @@ from typing import Any
 
 from conf.schema import require
 
-__all__ = ["Disturbance", "add", "named"]
-
 Disturbance = Callable[[Any], None]
 """Called with the `Plant`; sets fault switches of its parts, arrays of shape (N,), by `plant.age_min` or any state."""
 

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Tape", "spread", "streams", "uniform"]
-
 Array = NDArray[np.float64]
 Streams = Sequence[np.random.Generator]
 

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from conf.messages import NotAllowed
 from conf.schema import check, part, setting
 from envs.bench import Bench
-from envs.integrators import INTEGRATORS
+from envs.integrators import INTEGRATORS, Array
 from envs.plant.culture import Culture, GrowthConfig
 from envs.plant.disturbance import named
 from envs.plant.noise import Streams, Tape, spread, streams, uniform
@@ -23,10 +22,6 @@ from envs.plant.sensor import OdSensor, SensorConfig
 from envs.plant.strains import Strain, response
 from envs.plant.thermal import Thermal, ThermalConfig
 from envs.plant.vessel import Vessel, VesselConfig
-
-__all__ = ["LIGHTS", "STRAINS", "TOLD", "LightSensor", "Plant", "PlantConfig", "told"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 from envs.plant.course import along, check_knots
-from envs.plant.noise import Streams, spread
-
-__all__ = ["FeedPump", "PumpConfig"]
-
-Array = NDArray[np.float64]
+from envs.plant.noise import Array, Streams, spread
 
 PRIME_IDLE_MIN = 10.0  # pause after which the line must be primed
 

@@ -6,11 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.plant.noise import Streams, Tape, spread, uniform
+from envs.plant.noise import Array, Streams, Tape, spread, uniform
 
-__all__ = ["OdSensor", "SensorConfig", "counts_from_od", "density", "od_from_counts"]
-
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = 1.833 R + 0.226 R^2, R = log10(blank / raw) (docs/device.md, OD measurement)

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["REFERENCE_TEMPERATURE", "TEMPERATURE_LAWS", "Curve", "Strain", "add_law", "cardinal", "response"]
-
 Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 

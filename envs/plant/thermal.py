@@ -3,14 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.plant.noise import Streams, uniform
-
-__all__ = ["Thermal", "ThermalConfig"]
-
-Array = NDArray[np.float64]
+from envs.plant.noise import Array, Streams, uniform
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,9 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 from envs.bench import VIAL_ML
-from envs.plant.noise import Streams, spread
+from envs.plant.noise import Array, Streams, spread
 from envs.plant.pump import PumpConfig
 
-__all__ = ["Vessel", "VesselConfig"]
-
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_VOLUME_ML = 1.0  # mL that no pump can remove; keeps concentrations finite

@@ -8,8 +8,6 @@ from envs.identification.calibration import IdentifyConfig
 from envs.identification.open_loop import OpenLoop
 from experiments.recordings.config import Source
 
-__all__ = ["CalibrateConfig"]
-
 LAWS = ("open_loop", "pi", "pi_tuned", "threshold", "proportional")
 
 

@@ -1,23 +1,37 @@
-"""Output of a calibration: summary.json, environment file, report on the console."""
+"""Files of a calibration: summary.json, the environment, and twin.yaml, the plant behind the recording as a preset."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from conf.schema import entries
+from conf.schema import Entry, entries
+from envs.bench import Bench
 from envs.identification.calibration import Calibration
 from envs.identification.drift import Drift
 from envs.identification.model import NotIdentifiable, Parameter
 from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
+from envs.identification.twin import Course, Twin
 from envs.identification.verdict import Verdict
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
+from envs.plant.vessel import VesselConfig
 from envs.task import EnvConfig
-from experiments.calibration.twin_file import yaml_line
 from experiments.recordings.reader import Recording
 
-__all__ = ["environment_yaml", "refusal", "report", "summary"]
+Array = NDArray[np.float64]
 
+DIGITS, WIDTH = 5, 120
+LEFT = (
+    "What one recording cannot show stays at its default: dead time, shortest pulse and priming of the pump (its flow "
+    "holds for pulses as long as the recorded ones), spread between vials, slope and blank of the sensor, substrate, "
+    "temperature, wall."
+)
 PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the window, least-squares fit run freely from its start"
 
 
@@ -133,77 +147,85 @@ def environment_yaml(result: Calibration, source: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
-    """Describe the result for a person in a dozen lines, the verdict first."""
-    mu, tau, v = result.mu, result.tau, result.validation
-    first, end = result.window_rows
-    lines = [
-        "",
-        result.verdict.line(),
-        "",
-        f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   "
-        f"(doubling time {content['doubling_min']:.1f} min)",
-        f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   "
-        f"(dilution {0.02 / tau.value:.4f} 1/min at 0.02 mL/s)",
-        f"  window      rows {first}:{end}, {result.window_reason}",
-        *_disturbances(result),
-        *_beside(result),
-        f"  PMSE        {result.pmse_pct:.3g} %   (100 sum e^2 / sum OD^2 of the free-running least-squares fit, as in "
-        f"the paper; {result.pair_pmse_pct:.3g} % with the returned pair)",
-    ]
-    if v.holdout_pct is not None and v.early_pct is not None:
-        lines.append(
-            f"  held out    PMSE {v.holdout_pct:.3g} % over the window's last 30 % with the pair of the first 70 %, "
-            f"{v.early_pct:.3g} % over its own rows; an hour ahead each"
-        )
-    lines += [
-        f"  {a.minutes:.0f} min ahead {a.model_pct:.2g} % rms, the first half predicts the second; the OD stays: "
-        f"{a.od_stays_pct:.2g} %; the slope of 20 min goes on: {a.same_slope_pct:.2g} %"
-        for a in v.ahead
-    ]
-    if v.outside_pct is not None:
-        lines.append(
-            f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, from a new start"
-        )
-    for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
-        if drift is not None and drift.significant:
-            lines.append(
-                f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
-                f"({drift.change_pct:+.0f} %)"
-            )
-    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.screened.rejections]
-    lines += [f"  note        {note}" for note in recording.notes]
-    lines += [f"  against     {warning}" for warning in result.warnings]
-    return "\n".join(lines)
-
-
-def _disturbances(result: Calibration) -> list[str]:
-    """Describe the estimated disturbances of the bench."""
-    if not result.sound:
-        return []
-    q = result.estimate.quality
-    doses, growth, late = (
-        f"{100 * p.value:.0f} % ({100 * p.low:.0f} to {100 * p.high:.0f})"
-        for p in (q.dose_spread, q.growth_spread, q.late_share)
+def plant_of(found: Twin) -> PlantConfig:
+    """Convert the twin to a plant. Raises: ValueError with the value that is out of range for a plant."""
+    volume = Bench.volume_ml  # a recording determines only flow over volume: the file has both
+    flow, knots = volume / (60.0 * found.tau.value), _numbers(found.knot_min)
+    growth = GrowthConfig(mu=_mean(found.mu.value), knots_min=knots, knots_mu=_numbers(found.mu.value))
+    pump = PumpConfig(dosing="pulse", gain_ml_s=_mean(flow), pulse_cv=_rounded(found.noise.dose_cv))
+    if found.drifts:
+        pump = replace(pump, knots_min=knots, knots_ml_s=_numbers(flow))
+    noise = found.noise
+    sensor = SensorConfig(
+        noise_floor=_rounded(noise.floor),
+        noise_relative=_rounded(noise.relative),
+        lag1=_rounded(noise.lag1),
+        outlier_rate=_rounded(noise.outlier_rate),
     )
-    return [
-        f"  bench       doses spread by {doses}; {late} of a dose shows one reading late; "
-        f"readings by {100 * q.noise:.1f} %",
-        f"  culture     growth rate fluctuates by {growth} from hour to hour",
-    ]
+    return PlantConfig(growth, pump, sensor, VesselConfig(volume), start_od=_rounded(found.start_od), integrator="rk4")
 
 
-def _beside(result: Calibration) -> list[str]:
-    """Describe the pair of the other method."""
-    free, found = result.free_run, result.estimate
-    if result.method == "free_run":
-        other = None if not result.sound or found.tau is None else (found.mu, found.tau, "prediction_error")
+def twin_yaml(found: Twin, source: str) -> str:
+    """Write the file's text: all values that differ from a plant's defaults, with meaning and unit.
+
+    Raises: ValueError naming the value that no plant may have.
+    """
+    plant, (first, end) = plant_of(found), found.rows
+    hours = found.knot_min[-1] / 60.0
+    tau = "at the knots" if found.drifts else "constant, since the recording does not show its drift"
+    said = (
+        "The plant behind a recording, written by calibrate, for deploy plant_file=FILE and benchmark plant_file=FILE.",
+        f"Recording {source}, rows {first}:{end}, {hours:.1f} h, a reading every {found.row_min:.3g} min. Age 0 is the "
+        "first of these rows; start_min begins later.",
+        f"mu at the knots, 95 %: {_band(found.mu)} 1/min.",
+        f"tau {tau}, 95 %: {_band(found.tau if found.drifts else _first(found.tau))}; flow = volume / (60 tau).",
+        LEFT,
+    )
+    lines = [line for text in said for line in wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ")]
+    nominal = PlantConfig()
+    for own, usual in zip(entries(plant), entries(nominal), strict=True):
+        if own.value == usual.value:
+            continue
+        if own.name in ("growth", "pump", "sensor", "vessel"):
+            lines.append(f"{own.name}:")
+            changed = zip(entries(own.value), entries(usual.value), strict=True)
+            lines += [f"  {yaml_line(e)}" for e, was in changed if e.value != was.value]
+        else:
+            lines.append(yaml_line(own))
+    return "\n".join(lines) + "\n"
+
+
+def yaml_line(entry: Entry) -> str:
+    """Write a value with its meaning and unit behind it."""
+    value = entry.value
+    if isinstance(value, tuple):
+        text = "[" + ", ".join(_plain(v) for v in value) + "]"
     else:
-        other = None if free is None or free.tau is None else (free.mu, free.tau, "free_run")
-    if other is None:
-        return []
-    mu, tau, name = other
-    return [
-        f"  beside      {name}: mu {mu.value:.5f} ({mu.low:.5f} to {mu.high:.5f}), "
-        f"tau {tau.value:.4f} ({tau.low:.4f} to {tau.high:.4f})"
-    ]
+        text = _plain(value) if isinstance(value, float) else str(value)
+    return f"{entry.name}: {text} # " + ", ".join(filter(None, (entry.said.what, entry.said.unit)))
+
+
+def _plain(value: float) -> str:
+    """Write a number so that YAML reads it back: 5e-05 would be a string there."""
+    return np.format_float_positional(value, trim="0")
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _numbers(values: Array) -> tuple[float, ...]:
+    return tuple(_rounded(float(v)) for v in values)
+
+
+def _mean(values: Array) -> float:
+    """Over the time between evenly spaced knots."""
+    return _rounded(float(np.trapezoid(values) / (len(values) - 1)))
+
+
+def _first(course: Course) -> Course:
+    return Course(course.value[:1], course.low[:1], course.high[:1])
+
+
+def _band(course: Course) -> str:
+    return ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(course.low, course.high, strict=True))

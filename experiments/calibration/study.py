@@ -18,8 +18,6 @@ from experiments.laws.base import Controller
 from experiments.laws.density.baselines import Threshold, ThresholdConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["against_truth", "coverage", "fitted", "simulated"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Fitted = Calibration | str

@@ -8,8 +8,6 @@ from envs.plant.plant import PlantConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 
-__all__ = ["read_env_file", "read_plant_file"]
-
 T = TypeVar("T")
 
 

@@ -19,8 +19,6 @@ from omegaconf import DictConfig, OmegaConf
 from conf import guests, presets
 from experiments.cli import files
 
-__all__ = ["VARIABLE", "keep", "kept", "load_all", "offer", "preset_file", "taken"]
-
 VARIABLE, FOLDER = "TURBIDOSTAT_EXTEND", "extensions"
 RECIPES = ("experiment", "hparams_search")  # groups whose presets are at the root of the config
 _loaded: dict[Path, str] = {}  # file -> name of its module

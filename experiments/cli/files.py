@@ -12,10 +12,8 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hardware.storage import atomic
-from hardware.storage.journal import plain
+from hardware.storage.journal import plain as plain
 from hardware.storage.yaml_text import problem, read_text
-
-__all__ = ["choices", "given", "load_yaml", "plain", "write_json"]
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:

@@ -30,9 +30,9 @@ from conf.presets import program
 from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
 from experiments.cli.start import stopped, version
-from experiments.cli.words import UserError, normalise, refusing
-
-__all__ = ["EntryPoint", "UserError", "compose", "load", "normalise", "refusing", "save_config", "swept"]
+from experiments.cli.words import UserError as UserError
+from experiments.cli.words import normalise as normalise
+from experiments.cli.words import refusing as refusing
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -48,7 +48,6 @@ class _Once(logging.Filter):
         self._said: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """See `logging.Filter`."""
         if record.levelno != logging.WARNING:
             return True
         kind = re.sub(r"\d+", "", record.getMessage())
@@ -80,7 +79,6 @@ SEVERAL = re.compile(r"(?:Sweep parameters|Ambiguous value for argument) '\+*(.+
 
 
 def _one_line(error: Exception) -> str:
-    """Put a message on one line."""
     lines = [line.strip() for line in str(error).splitlines()]
     if several := SEVERAL.match(lines[0] if lines else ""):
         word = several[1]
@@ -220,7 +218,6 @@ class EntryPoint(Generic[T]):
             sys.exit(1)
 
     def _answer(self, given: list[str]) -> None:
-        """Show the help or the config, or start a run or sweep."""
         with refusing(ValueError):
             given = [latest.resolved(arg, self.name) for arg in given]
         flags = {a for a in given if a.startswith("-")}
@@ -257,7 +254,6 @@ class EntryPoint(Generic[T]):
         self._hydra()
 
     def _hydra(self) -> None:
-        """Run Hydra on the command line."""
         sys.argv.append(f"hydra.job.name={self.name}")
         if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
             sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
@@ -287,7 +283,6 @@ class EntryPoint(Generic[T]):
             sys.exit(1)
 
     def _refuse(self, jobs: list[list[str]]) -> None:
-        """Refuse invalid arguments before a folder is created. Raises: UserError of the first job."""
         refusals = []
         for job in jobs:
             try:
@@ -299,7 +294,6 @@ class EntryPoint(Generic[T]):
             raise refusals[0]
 
     def _job(self, cfg: DictConfig) -> float | None:
-        """Run once in a folder."""
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         extensions.load_all()  # not loaded yet in a worker of a sweep
         if swept():
@@ -342,7 +336,6 @@ class EntryPoint(Generic[T]):
             return None
 
     def _once(self, cfg: DictConfig, folder: Path, job: sweep.Job) -> float | None:
-        """Run the missing part of a job."""
         try:
             config = load(cfg, self.schema)
             job.begin(config)

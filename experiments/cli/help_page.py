@@ -12,8 +12,6 @@ from conf.messages import NotAllowed
 from conf.presets import chosen, opening, options, sentence
 from conf.schema import entries
 
-__all__ = ["shown", "text"]
-
 WIDTH = 118
 LEFT = 44  # columns of `key = value`
 
@@ -32,7 +30,6 @@ def shown(value: Any) -> str:
 
 
 def _line(left: str, right: str, at: int) -> list[str]:
-    """Format two columns; wrap the right one."""
     lines = textwrap.wrap(right, WIDTH - at) or [""]
     head = [left] if len(left) > at - 2 else []
     lines[0] = (" " * at if head else left.ljust(at)) + lines[0]
@@ -72,7 +69,6 @@ def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
 
 
 def _group(name: str, group: str, start: str | None) -> list[str]:
-    """Describe a config group: each of its presets with a sentence."""
     lines = [f"  {group}=" + (f"    (by itself {start})" if start else "")]
     return lines + [
         x for option in options(name, group) for x in _line(f"    {option}", sentence(f"{group}/{option}"), 26)
@@ -80,7 +76,6 @@ def _group(name: str, group: str, start: str | None) -> list[str]:
 
 
 def _short(name: str, config: Any) -> list[str]:
-    """Write examples, presets, and the command's own keys; only the names of parts."""
     choices = [
         line
         for group, start in chosen(name).items()

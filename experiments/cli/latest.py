@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["ROOT", "newest", "resolved"]
-
 ROOT = Path("runs")
 WRITTEN = {
     "env_file": (("calibrate/**/calibrated.yaml", "demo/*/1_calibrate/calibrated.yaml"), "calibrate"),

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Generic, TextIO, TypeVar
 
-__all__ = ["Outlet", "Screen", "detach"]
-
 T = TypeVar("T")
 LAST_S, WAITING = 2.0, 2000  # for remaining output at the end of a program; largest number of waiting pieces
 

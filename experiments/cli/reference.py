@@ -19,8 +19,6 @@ from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 from experiments.reporting.tables import markdown
 
-__all__ = ["page"]
-
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
 SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
@@ -68,7 +66,6 @@ def _said(name: str) -> str:
 
 
 def _anchor(heading: str) -> str:
-    """Return the anchor of a heading."""
     return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
 
 
@@ -103,7 +100,6 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
 
 
 def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
-    """Write a row per field; a part has a table of its own."""
     rows = []
     for entry in entries(config):
         of = _part(config, entry)
@@ -115,7 +111,6 @@ def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
 
 
 def _changes(name: str) -> str:
-    """List the values of a preset's own file, and the preset it starts from."""
     own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
     changed = ", ".join(f"`{key}={shown(value)}`" for key, value in flat(own))

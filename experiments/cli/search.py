@@ -23,8 +23,6 @@ from omegaconf import DictConfig
 from experiments.cli import files
 from experiments.cli.words import EXTRA, UserError
 
-__all__ = ["JOURNAL", "Search", "register"]
-
 log = logging.getLogger(__name__)
 
 NAME = "hydra_plugins.search.Search"  # as in conf/hydra/sweeper/search.yaml; Hydra accepts no other package
@@ -76,7 +74,6 @@ class Search(Sweeper):
         )
 
     def _open(self) -> Any:
-        """Open the study in the folder, or create it."""
         optuna: Any = import_module("optuna")
         optuna.logging.set_verbosity(logging.WARNING)
         (self.folder / ".trials").mkdir(parents=True, exist_ok=True)
@@ -128,13 +125,11 @@ class Search(Sweeper):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Exclude other processes from taking trials in this context."""
         with open(self.folder / ".trials" / "all", "w") as file:
             fcntl.lockf(file, fcntl.LOCK_EX)
             yield
 
     def _tell(self, study: Any, number: int, job: JobReturn) -> None:
-        """Report a result to the study; a job without a result has failed."""
         try:
             study.tell(number, float(job.return_value))
         except Exception as error:  # any error of the job
@@ -143,7 +138,6 @@ class Search(Sweeper):
         self._held.pop(number).close()
 
     def _best(self, study: Any) -> None:
-        """Log the best trial, and write it as best.json."""
         done = [t for t in study.get_trials(deepcopy=False) if t.value is not None]
         if not done:
             return

@@ -1,12 +1,11 @@
 """Checks before a command imports anything: origin of the packages, and Ctrl-C during the start."""
 
+import re
 import sys
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
-
-__all__ = ["begin", "stopped", "version"]
 
 PACKAGES = ("conf", "dqn", "envs", "hardware")
 HOME = Path(__file__).parents[2]  # folder of all packages of this project
@@ -36,8 +35,12 @@ def _other_package() -> str | None:
 
 
 def version() -> str:
-    """Write the text of `--version`."""
-    return f"turbidostat-dqn {metadata.version('turbidostat-dqn')}"
+    """Write name and version of this program; from pyproject.toml if it is not installed."""
+    try:
+        return f"turbidostat-dqn {metadata.version('turbidostat-dqn')}"
+    except metadata.PackageNotFoundError:
+        found = re.search(r'^version = "([^"]+)"', (HOME / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
+        return f"turbidostat-dqn {found[1] if found else 'unknown'}"
 
 
 def stopped() -> str:

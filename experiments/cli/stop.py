@@ -16,11 +16,6 @@ from typing import ParamSpec, TypeVar
 from experiments.cli import extensions
 from experiments.cli.messages import PumpsBeingEnded
 
-__all__ = [
-    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "heard", "interrupts", "one_interrupt", "pausing",
-    "undisturbed", "unmasked",
-]  # fmt: skip
-
 P = ParamSpec("P")
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -42,6 +37,16 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> 
     finally:
         for number, old in before.items():
             signal.signal(number, old)
+
+
+@contextmanager
+def blocked(*numbers: int) -> Iterator[None]:
+    """Let these signals wait in this context, so that none arrives between two handlers."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Wait:
@@ -230,11 +235,8 @@ class Workers(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Submit as to an executor. A new process inherits the blocked signals."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-        try:
+        with blocked(signal.SIGINT, signal.SIGHUP):
             return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -18,8 +18,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from experiments.cli import files
 from experiments.cli.words import UserError
 
-__all__ = ["FLAGS", "Busy", "Job", "Sweep", "asked", "errors", "fresh", "jobs", "progress", "read", "survey", "working"]
-
 RECORD, JOB = "sweep.json", "job.json"
 SEARCH = "hparams_search="
 FLAGS = ("-m", "--multirun")
@@ -58,7 +56,6 @@ class Sweep:
 
 
 def _lasting(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments that must not differ between starts of a sweep."""
     return [a for a in arguments if not a.startswith(LATER)]
 
 
@@ -194,7 +191,6 @@ def working(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def _free(folder: Path) -> bool:
-    """Return whether no process works on a job."""
     try:
         with working(folder):
             return True

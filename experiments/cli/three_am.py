@@ -10,8 +10,6 @@ from conf.presets import ROOT
 from experiments.reporting.tables import markdown
 from hardware.messages import Fault
 
-__all__ = ["PAGE", "declared", "page"]
-
 PAGE = ROOT.parent / "docs" / "three_am.md"
 TABLE = re.compile(r"(<!-- (alarms|notes|errors) of (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

@@ -10,8 +10,6 @@ from conf import presets
 from conf.messages import Message
 from experiments.cli import extensions, latest
 
-__all__ = ["EXTRA", "RUN", "UserError", "normalise", "refusing", "resumed"]
-
 RUN = "hydra.run.dir="
 EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 

@@ -238,7 +238,7 @@ class Share:
         """See `Signal.dosed`; what was put off comes later."""
         self.estimator.dosed(volume_ml)
 
-    def figures(self, table: Any, title: str) -> dict[str, Any]:
+    def draw(self, table: Any, title: str) -> dict[str, Any]:
         """See `Draws.figures`."""
         from experiments.coculture.charts import composition_figure_of  # Matplotlib
 

@@ -19,7 +19,6 @@ from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.cli.calibrated import read_env_file, read_plant_file
@@ -27,24 +26,21 @@ from experiments.cli.files import choices
 from experiments.control import messages
 from experiments.control.config import DeployConfig
 from experiments.control.guests import GUESTS
-from experiments.control.policies import WantedPolicy, admit, policy_check, run_policy
+from experiments.control.policies import WantedPolicy, policy_check, run_policy
 from experiments.laws import registry
-from experiments.laws.density.learned import settings
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.progress import Progress
 from experiments.loop.signals import AIM, Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop, is_over
-from hardware.errors import ReactorError, UnfitError
+from hardware.errors import ReactorError
 from hardware.family import Family, Opening, family_of, report
-from hardware.reactor import Reactor
+from hardware.reactor import Array, Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.watch.opened import WatchedFamily
 from hardware.watched import WatchedInterlock
-
-__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +91,6 @@ class Setup:
 def completed(config: DeployConfig, folder: Path | None = None) -> DeployConfig:
     """Fill in what guests complete. Args: as of `Guest.completed`. Raises: UserError."""
     with frame.refusing(ValueError, ReactorError):
-        config.schedules()
         for guest in GUESTS:
             config = guest.completed(config, folder)
     return config
@@ -111,7 +106,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         family = WatchedFamily(family)
     resumed = config.resume is not None
     with frame.refusing(ValueError):
-        scenarios, ends = config.schedules(), config.ends()
+        scenarios, ends, roles = config.schedules(), config.ends(), config.roles()
     if resumed and not family.can.resume:
         why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
         raise messages.CannotResume(run=config.resume, why=why)
@@ -123,6 +118,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if not family.simulated and config.plant not in usual:
         log.warning(messages.PlantIgnored(backend=config.backend.kind))
     _check_fit(config, family, scenarios, ends)
+    _check_room(bench, safety, family.rim_ml(volumes_ml) - volumes_ml)
     further = _further(config, plant, folder, scenarios)
     if any(signal.sees_light for signal in further):  # the device has to measure it
         backend = family.seeing_fluorescence(backend)
@@ -131,17 +127,12 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     wanted = policy = bounds = None
     if config.controller.kind == "dqn":
         asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
-        changes = config.controller.estimator
-        stake = config.poor_regret_pct, family.at_stake, config.force_policy
+        changes, stake = config.controller.estimator, (family.at_stake, config.force_policy)
         wanted = WantedPolicy(config.policy, bench, model, changes, asked, *stake)
     if wanted is not None and not config.preflight_only:
-        policy = run_policy(wanted, folder, resumed)
-        admit(policy, folder / "policy.npz", wanted, resumed)
-        with frame.refusing(ValueError):
-            own = settings(policy, changes)
-        bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
+        policy, bounds = run_policy(wanted, folder, resumed)
     return Setup(
-        family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
+        family, backend, bench, safety, scenarios, ends, roles, plant, model, config.controller, wanted,
         policy, bounds, further, config.fsync, *_named(config, family, folder),
         resumed,
     )  # fmt: skip
@@ -171,23 +162,20 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
             raise messages.KnowsThePlant(controller=law, backend=kind) from None
     with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
-        _check_room(config, family)
 
 
-def _check_room(config: DeployConfig, family: Family) -> None:
-    """Whether the largest dose may be given at all: by the vial and by the budget of a minute. Raises: UnfitError."""
-    bench, tubes_ml = config.bench, config.bench.volumes(config.backend.reactors)
-    room_ml = float(np.min(np.minimum(config.safety.overflow_ml, family.rim_ml(tubes_ml) - tubes_ml)))
-    largest_ml, allowed_ml = bench.max_rate * bench.period_s, min(room_ml, config.safety.ml_a_minute(bench))
+def _check_room(bench: Bench, safety: SafetyConfig, above_ml: Array) -> None:
+    """Check that the largest dose may be given at all, by the vial and by the budget of a minute. Raises: UserError.
+
+    Args: above_ml: room of each vial above its tube, mL, (N,).
+    """
+    room_ml = float(np.min(np.minimum(safety.overflow_ml, above_ml)))
+    largest_ml, allowed_ml = bench.max_rate * bench.period_s, min(room_ml, safety.ml_a_minute(bench))
     if largest_ml > allowed_ml + 1e-9:
-        given = (
-            f"bench.max_rate = {bench.max_rate:g} mL/s over {bench.period_s:g} s comes to {largest_ml:.3g} mL at once"
-        )
-        why = "what a vial has room for above its tube, and safety.ml_per_minute"
+        given = f"bench.max_rate = {bench.max_rate:g} over {bench.period_s:g} s comes to {largest_ml:.3g} mL at once"
+        allowed = f"{max(allowed_ml, 0.0):.3g} mL (what a vial has room for above its tube, and safety.ml_per_minute)"
         least = max(np.floor(1e5 * allowed_ml / bench.period_s) / 1e5, 0.0)
-        raise UnfitError(
-            f"{given}: allowed {max(allowed_ml, 0.0):.3g} mL ({why}); give bench.max_rate={least:g} or less"
-        )
+        raise frame.UserError(f"{given}: allowed {allowed}; give bench.max_rate={least:g} or less")
 
 
 def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dict[str, float | str]]:

@@ -14,8 +14,6 @@ from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig"]
-
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
 
@@ -45,12 +43,6 @@ class DeployConfig:
         "shipped",
         "policy of controller=dqn: `shipped` (needs no calibration), a policy.npz, a run folder, or `latest`: the "
         "newest one of train or demo",
-    )
-    poor_regret_pct: float = setting(
-        10.0,
-        "regret above which a run warns of a policy; the worst of 32 seeds of agent=paper has 11",
-        "%",
-        above=0.0,
     )
     force_policy: bool = setting(False, "run a policy on a device without a certificate that it is safe for this run")
     signals: dict[str, Any] = setting(

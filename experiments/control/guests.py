@@ -7,8 +7,6 @@ from envs.scenario import Scenario
 from experiments.control.config import DeployConfig
 from experiments.loop.signals import Signal
 
-__all__ = ["GUESTS", "Guest", "add"]
-
 
 class Guest:
     """One that adds nothing; every part may be left as it is."""

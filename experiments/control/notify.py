@@ -23,8 +23,6 @@ from experiments.cli import frame
 from experiments.cli.outlet import Outlet
 from experiments.control import messages
 
-__all__ = ["HOOK", "Hook", "Notifier", "hidden", "opened"]
-
 log = logging.getLogger(__name__)
 
 HOOK = "DEPLOY_HOOK"  # variable in which an address of the command line goes on

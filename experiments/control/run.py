@@ -18,23 +18,15 @@ from experiments.control.config import DeployConfig
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.signals import Draws
+from experiments.record.curves import windows_table
 from experiments.record.messages import AlarmsTold
 from experiments.record.record import Record
-from experiments.record.summary import (
-    ChangeLog,
-    figure_of,
-    metrics_table,
-    reasons_line,
-    signals_table,
-    summarise,
-)
+from experiments.record.summary import ChangeLog, figure_of, reasons_line, summarise
 from experiments.reporting import charts
 from hardware.clock import boot
 from hardware.errors import ReactorError, RecordingError
 from hardware.storage.marks import NAME, Mark, read_marks
 from hardware.watched import Watched
-
-__all__ = ["BenchMarks", "deploy"]
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +128,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         table = record.table()
         figures = {"closed_loop": figure_of(table, setup.scenarios, title)}
         for signal in setup.further:
-            figures |= signal.figures(table, title) if isinstance(signal, Draws) else {}
+            figures |= signal.draw(table, title) if isinstance(signal, Draws) else {}
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {
             **summarise(table, setup.scenarios, setup.roles, outcome, loop.progress),
@@ -150,10 +142,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
     for name, rows in zip(record.names, record.rows, strict=True):
         if line := reasons_line(rows):
             log.warning(AlarmsTold(reactor=name, kinds=line))
-    what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
-    log.info("%s\n%s", what, metrics_table(summary["windows"]))
-    if signals := signals_table(summary["windows"]):
-        log.info("beside the density, estimated unless it says true\n%s", signals)
+    log.info("windows; settled: until |e| stays within 5 %%\n%s", windows_table(summary["windows"]))
     log.info("recordings %s; figure %s", folder / "recordings", summary["figure"])
     log.info("next, all of it on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
     return outcome

@@ -15,8 +15,6 @@ from experiments.control.config import DeployConfig
 from experiments.control.guests import GUESTS
 from hardware.errors import ReactorError
 
-__all__ = ["Expected", "expected", "timetable"]
-
 HEAD = f"  {'step':>8} {'from':>12} {'to':>12} {'min':>7} {'at most':>8} {'OD':>6} {'degC':>6} {'mL':>7}  until"
 
 
@@ -145,7 +143,6 @@ def _spare(scenario: Scenario, k: int, minutes: float) -> dict[int, float]:
 
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:
-    """Whether bottle and budget last."""
     limit, key = min((setup.bench.bottle_ml, "bench.bottle_ml"), (setup.safety.ml_per_run, "safety.ml_per_run"))
     if most <= limit:
         return f"{key}={limit:g} lasts"

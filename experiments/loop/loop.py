@@ -25,8 +25,6 @@ from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import RAW_MAX, Response
 from hardware.safety.interlock import Interlock, Ruling
 
-__all__ = ["ClosedLoop", "Step"]
-
 OURS = (THERMOSTAT, *SPARE.values())  # the others reach the reactors by their names
 
 
@@ -164,16 +162,8 @@ class ClosedLoop:
 
         ahead = self.progress.following(elapsed) if self.progress.announced else None
         sample = Sample.of(m, self.interlock, rows, believed, elapsed, phase, setpoint, temperature, ahead)
-        decided = self.density.decide(sample)
-        commands: dict[str, Array] = {}
-        for signal, actuator in self._commanded:
-            asked = shaped(signal.decide(sample), len(self.done), f"signal {signal.name}: what decide returns")
-            command = self.interlock.command(actuator, asked)
-            if actuator == THERMOSTAT:
-                command = temperature = np.where(np.isfinite(command), command, temperature)
-            elif actuator.pump:
-                self.supply.ask(actuator.pump, command)
-            commands[actuator.name] = command
+        decided, commands = self.density.decide(sample), self._commands(sample)
+        temperature = commands.get(THERMOSTAT.name, temperature)
         steered = believed & (phase >= 0)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         proposed = np.where(dilutes & np.isnan(self.began), self.interlock.bench.max_rate, proposed)
@@ -183,17 +173,7 @@ class ClosedLoop:
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
-        columns: dict[str, Array] = {AIM: self.density.aim} if self.progress.announced else {}
-        explanation: dict[str, Array] = {}
-        reasons: Sequence[str | None] = verdict.reasons
-        for signal in self.signals:
-            found = signal.find(sample, commands.get(signal.actuator, verdict.rate))
-            for name, values in found.columns.items():
-                shaped(values, len(self.done), f"signal {signal.name}: {name}")
-            columns, explanation = columns | dict(found.columns), explanation | dict(found.why)
-            if found.warnings:
-                reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]
-
+        columns, explanation, reasons = self._findings(sample, commands, verdict)
         decision = Step(
             now_s=now,
             rows=rows,
@@ -233,6 +213,35 @@ class ClosedLoop:
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
+
+    def _commands(self, sample: Sample) -> dict[str, Array]:
+        """Ask each signal beside the density; return the commands by actuator, as cut by the interlock."""
+        commands: dict[str, Array] = {}
+        for signal, actuator in self._commanded:
+            asked = shaped(signal.decide(sample), len(self.done), f"signal {signal.name}: what decide returns")
+            command = self.interlock.command(actuator, asked)
+            if actuator == THERMOSTAT:
+                command = np.where(np.isfinite(command), command, sample.temperature)
+            elif actuator.pump:
+                self.supply.ask(actuator.pump, command)
+            commands[actuator.name] = command
+        return commands
+
+    def _findings(
+        self, sample: Sample, commands: Mapping[str, Array], verdict: Ruling
+    ) -> tuple[dict[str, Array], dict[str, Array], Sequence[str | None]]:
+        """Collect what the signals tell of a sample: columns, why, and their warnings with the interlock's reasons."""
+        columns: dict[str, Array] = {AIM: self.density.aim} if self.progress.announced else {}
+        why: dict[str, Array] = {}
+        reasons: Sequence[str | None] = verdict.reasons
+        for signal in self.signals:
+            found = signal.find(sample, commands.get(signal.actuator, verdict.rate))
+            for name, values in found.columns.items():
+                shaped(values, len(self.done), f"signal {signal.name}: {name}")
+            columns, why = columns | dict(found.columns), why | dict(found.why)
+            if found.warnings:
+                reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]
+        return columns, why, reasons
 
     def _book_repeats(self) -> None:
         """Book what the devices dosed by themselves at its own time, before the sample after it is judged."""

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LATE_MIN", "SETTLING_BAND", "STEADY_MIN", "WindowMetrics", "mean_errors", "window_metrics"]
-
 Array = NDArray[np.float64]
 
 SETTLING_BAND = 0.05  # relative: settled from the first moment after which |e| <= 5 % of the setpoint for good

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from envs.scenario import Conditions, Scenario
 from experiments.laws.base import Array, Mask
 
-__all__ = ["CONDITION", "TIME", "Progress"]
-
 CONDITION, TIME = "condition", "time"  # why a step ended
 Phases = NDArray[np.intp]
 

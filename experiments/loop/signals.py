@@ -24,24 +24,6 @@ from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
-__all__ = [
-    "AIM",
-    "ESTIMATED",
-    "TRUE",
-    "Counted",
-    "Density",
-    "Draws",
-    "Findings",
-    "Knows",
-    "Sample",
-    "Signal",
-    "add",
-    "fitting",
-    "made",
-    "shaped",
-    "within_2sd",
-]
-
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
 AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
@@ -109,17 +91,12 @@ class Signal(Protocol):
     every window. sees_light: whether it needs the fluorescence, which the device then measures.
     """
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def actuator(self) -> str: ...
+    name: str
+    actuator: str
+    sees_light: bool
 
     @property
     def columns(self) -> tuple[str, ...]: ...
-
-    @property
-    def sees_light(self) -> bool: ...
 
     def decide(self, sample: Sample) -> Array:
         """Watch a sample and decide on a command, (N,), in the unit of the actuator: mL/s, degC.
@@ -160,7 +137,7 @@ class Knows(Protocol):
 class Draws(Protocol):
     """A signal that has figures of its own."""
 
-    def figures(self, table: Any, title: str) -> Mapping[str, Any]:
+    def draw(self, table: Any, title: str) -> Mapping[str, Any]:
         """Draw them, by name, at the end of a run. Args: table: its recordings (`experiments/record/record.py`)."""
 
 
@@ -223,7 +200,6 @@ class Density:
         self.truth = truth
 
     def decide(self, sample: Sample) -> Array:
-        """See `Signal.decide`."""
         m = sample.measured
         if isinstance(self.law, Watches):
             self.law.watch(m.od, m.temperature, sample.minute, sample.believed)
@@ -241,7 +217,6 @@ class Density:
         return np.where(behind & (ahead != sample.setpoint), sample.following, ahead)
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """See `Signal.find`; in a simulation also what e and s truly are, where the law estimates them."""
         why = self.law.explain() if isinstance(self.law, Explains) else {}
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
@@ -252,13 +227,11 @@ class Density:
         return Findings(why=why, warnings=warnings if any(warnings) else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
-        """See `Signal.dosed`."""
         if isinstance(self.law, Accounts):
             self.law.dosed((volume_ml + kept_ml) / self._scale)
 
     @property
     def memory(self) -> Remembers | None:
-        """See `Signal.memory`: that of the law."""
         return self.law if isinstance(self.law, Remembers) else None
 
 

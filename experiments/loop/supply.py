@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from envs.scenario import DOSE_ML, MADE_UP_MIN, PUMPS, Scenario, outputs_of
 from experiments.laws.base import Array, Mask
 
-__all__ = ["Supply"]
-
 FEED_PUMP = 1
 
 

@@ -26,8 +26,6 @@ from experiments.reporting.page import Page
 from experiments.reporting.tables import Table, number, span
 from hardware.errors import RecordingError
 
-__all__ = ["INCOMPARABLE", "Believed", "believed", "decisions", "write"]
-
 Array = NDArray[np.float64]
 
 DECISION = '"kind":"decision"'
@@ -69,7 +67,6 @@ def believed(run: Path) -> Believed:
 
 
 def _bench(config: Mapping[str, Any]) -> Bench:
-    """Of the run. Raises: UserError."""
     with frame.refusing(ValueError):
         return build(Bench(), config.get("bench") or {}, "bench")
 
@@ -202,7 +199,6 @@ def _sure(why: Mapping[str, Array]) -> list[str]:
 
 
 def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
-    """Say what the interlock and a supervisor did."""
     supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
     reasons = summary.get("reasons")
     kinds = "; ".join(
@@ -220,7 +216,6 @@ def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
 
 
 def _segments(found: Agreement, name: str, reactor: str) -> Table:
-    """Every segment: the hours it covers and the three estimates with their intervals."""
     spans = sorted({s for c in (found.growth, found.net) for s in zip(c.first_min, c.end_min, strict=True)})
     estimates = [dict(zip(c.first_min, c.found, strict=True)) for c in (found.growth, found.gain, found.net)]
     rows = [(f"{a / 60:.1f} to {b / 60:.1f}", *(_shown(each.get(a)) for each in estimates)) for a, b in spans]

@@ -13,8 +13,6 @@ from experiments.reporting import tables
 from experiments.reporting.curves import BAND, CALLED, COLUMNS, DEPLOYMENT, PAGES, error_tag, signals_in
 from experiments.reporting.tensorboard import Events
 
-__all__ = ["Curves"]
-
 Array = NDArray[np.float64]
 
 WINDOW = {
@@ -79,7 +77,7 @@ class Curves:
         for name, path in pictures.items():
             self.run.picture(f"figures/{name}", path, self._last)
         windows = summary["windows"]
-        self.run.text("run/summary", f"{summary['outcome']}\n\n{_table(windows)}", self._last)
+        self.run.text("run/summary", f"{summary['outcome']}\n\n{windows_table(windows)}", self._last)
         self.run.scalars({tag: v for tag, v in _results(summary).items() if np.isfinite(v)}, self._last, when)
         self.run.hyper_parameters(row, self._folder)
 
@@ -95,7 +93,6 @@ class Curves:
 
 
 def _results(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Return the tags of a deployment's results, nan where there is none."""
 
     def known(key: str) -> Array:
         values = [w.get(key) for w in summary["windows"]]
@@ -111,8 +108,8 @@ def _results(summary: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the windows in Markdown."""
+def windows_table(windows: Sequence[Mapping[str, Any]]) -> str:
+    """Format the windows of a summary in Markdown, with the errors of further signals."""
     of_signals = {f"{s}_abs_error_mean": f"error of the {CALLED.get(s, s)}" for s in signals_in(windows)}
     titles = {key: title for key, title in (WINDOW | of_signals).items() if any(key in w for w in windows)}
     rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in titles] for w in windows]

@@ -27,8 +27,6 @@ from hardware.storage.marks import Mark, read_marks
 from hardware.storage.messages import NotWritten
 from hardware.storage.recorder import Recorder
 
-__all__ = ["Record", "Recordings"]
-
 log = logging.getLogger(__name__)
 
 

@@ -21,17 +21,12 @@ from conf.messages import Message
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record import messages
 from hardware.actuator import FEED
-from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal
 from hardware.storage.messages import RowDamaged
-
-__all__ = [
-    "COLUMNS", "REBUILD", "Row", "at_end", "complete", "continue_loop", "is_over", "load_state", "read_rows", "row_of",
-]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -110,20 +105,18 @@ class Rows:
 
 def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
     """Read the rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
-    found = Rows(columns)
+    found, line = Rows(columns), 1
     try:
-        file = open(path, newline="", encoding="utf-8")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise messages.RecordingUnreadable(path=path, why=error.strerror) from None
-    with file as f:
-        rows = csv.DictReader(f)
-        try:
-            for raw in rows:
+        with open(path, newline="", encoding="utf-8") as f:
+            for raw in (rows := csv.DictReader(f)):
+                line = rows.line_num
                 if raw.keys() != set(columns) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
                     raise ValueError("a row without a time, or not with a cell for every column")
                 found.append({key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
-        except (ValueError, csv.Error) as error:
-            raise messages.RecordingDamaged(path=path, line=max(rows.line_num, 1), why=error) from None
+    except OSError as error:
+        raise messages.RecordingUnreadable(path=path, why=error.strerror) from None
+    except (ValueError, csv.Error) as error:
+        raise messages.RecordingDamaged(path=path, line=line, why=error) from None
     return found
 
 
@@ -228,19 +221,15 @@ def load_state(path: Path) -> dict[str, Any]:
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise _no_state(path, error.strerror or str(error)) from None
+        raise messages.NoState(path=path, why=error.strerror or str(error)) from None
     except (ValueError, RecursionError) as error:
-        raise _no_state(path, f"not JSON: {error}") from None
+        raise messages.NoState(path=path, why=f"not JSON: {error}") from None
     if not isinstance(state, dict):
-        raise _no_state(path, f"it holds {str(state)[:40]}, expected keys and values")
+        raise messages.NoState(path=path, why=f"it holds {str(state)[:40]}, expected keys and values")
     known = state.get("journal_row", "missing")
     if type(known) is not int or known < 0:
-        raise _no_state(path, f"journal_row: {str(known)[:40]}, expected the number of a row")
+        raise messages.NoState(path=path, why=f"journal_row: {str(known)[:40]}, expected the number of a row")
     return state
-
-
-def _no_state(path: Path, why: str) -> RecordingError:
-    return messages.NoState(path=path, why=why)
 
 
 def is_over(journal: Journal, path: Path) -> bool:
@@ -269,7 +258,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         newer = [row for row in journal.rows if row["n"] >= state["journal_row"]]
         loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
-        raise _no_state(path, str(error)) from None
+        raise messages.NoState(path=path, why=str(error)) from None
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided, written = (
         {r["reactor"]: r["n"] for r in journal.rows if r["kind"] in kinds} for kinds in (KEPT[:1], KEPT)

@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -23,26 +23,9 @@ from experiments.reporting.curves import CALLED, signals_in
 from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 
-__all__ = [
-    "ChangeLog",
-    "figure_of",
-    "metrics_table",
-    "reasons_line",
-    "signals_table",
-    "summarise",
-]
-
 log = logging.getLogger(__name__)
 
-FORMATS = {  # of the metrics of a window
-    "ise": "8.4f",
-    "itae": "8.2f",
-    "ise_mean": "8.5f",
-    "itae_mean": "8.3f",
-    "settling_min": "8.1f",
-    "steady_abs_error": "8.4f",
-    "abs_error": "8.4f",
-}
+METRICS = ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error", "abs_error")  # of a window
 AGAIN_S = 3600.0
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
@@ -64,7 +47,6 @@ class ChangeLog:
         self._error, self._samples = np.zeros(len(self._names)), np.zeros(len(self._names))  # of the window so far
 
     def __call__(self, step: Step) -> None:
-        """Log what is new in this step."""
         for n, name in enumerate(self._names):
             if step.ended is not None and step.ended[n]:
                 log.info(self._ended(step, n))
@@ -108,14 +90,12 @@ class ChangeLog:
                 log.info(messages.NoteSeen(note=note))
 
     def _ended(self, step: Step, n: int) -> messages.StepEnded:
-        """Say which step of reactor n's schedule this sample ended, and why."""
         k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
         start, end, _ = self._progress.steps(n)[k]
         why = self._progress.conditions.texts[n][k]
         return messages.StepEnded(reactor=self._names[n], step=k + 1, minutes=end - start, why=why, od=step.od[n])
 
     def _window(self, step: Step, n: int) -> None:
-        """How well the window was held that ends with this step."""
         if self._samples[n]:
             mean = self._error[n] / self._samples[n]
             log.info(messages.WindowEnds(reactor=self._names[n], minute=step.minute[n], error=mean))
@@ -129,20 +109,6 @@ class ChangeLog:
             acts = (messages.SupervisorActs if supervised else messages.PolicyActs)(minute=step.minute[n])
             log.info(acts.about(self._names[n]))
             self._tell("hand_over", str(acts), self._names[n])
-
-
-def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a head and one line per window of a summary."""
-    heads = ("setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady", "mean |e|")
-    lines = [f"{'reactor':8} " + " ".join(f"{head:>8}" for head in heads)]
-    for w in windows:
-        cells = [f"{w[key]:{form}}" if w[key] == w[key] else f"{'–':>8}" for key, form in FORMATS.items()]
-        lines.append(f"{w['reactor']:8} {w['setpoint']:8.2f} " + " ".join(cells))
-    return "\n".join(lines)
-
-
-def _cell(value: float) -> str:
-    return f"{value:8.3f}" if np.isfinite(value) else f"{'–':>8}"
 
 
 def reasons_line(rows: Rows) -> str:
@@ -196,7 +162,7 @@ def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progres
             window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
             window["ended"] = step[2] if latest >= end - 1e-6 else None
             window["temperature"] = scenario.temperatures[phase]
-            window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
+            window |= {key: float(getattr(m, key)[0]) for key in METRICS}
             window |= _further(table, n, start, end)
             rows.append(window)
     return rows
@@ -222,24 +188,6 @@ def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, A
         density, _ = mean_errors(minute, table.od()[n : n + 1], own["setpoint"], start, end)
         found["od_abs_error_mean"] = float(density[0])
     return found
-
-
-def signals_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a head and one line per window in which another signal was to be held; "" if there is none."""
-    lines = []
-    for signal in signals_in(windows):
-        keys = {"asked": f"{signal}_setpoint", "mean |e|": f"{signal}_abs_error_mean"}
-        keys |= {"last 2 h": f"{signal}_abs_error_last2h", "true |e|": f"true_{signal}_abs_error_mean"}
-        keys["OD |e|"] = "od_abs_error_mean"
-        kept = [w for w in windows if np.isfinite(w.get(keys["mean |e|"], np.nan))]
-        known = {head: key for head, key in keys.items() if kept and key in kept[0]}
-        if kept:
-            lines.append(f"{CALLED.get(signal, signal):8} {'hours':>11} " + " ".join(f"{head:>8}" for head in known))
-        for w in kept:
-            hours = f"{w['start_min'] / 60:.1f}-{w['end_min'] / 60:.1f}"
-            cells = [f"{'varies':>8}" if w[key] is None else _cell(w[key]) for key in known.values()]
-            lines.append(f"{w['reactor']:8} {hours:>11} " + " ".join(cells))
-    return "\n".join(lines)
 
 
 def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> Figure:

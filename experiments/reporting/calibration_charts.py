@@ -1,11 +1,11 @@
 """Figures of a calibration: measurement and model, drift, coverage; comparison of a run with its model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from envs.identification.agreement import Agreement, Compared
 from envs.identification.calibration import Calibration
@@ -13,11 +13,7 @@ from envs.identification.drift import Segment
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.identification.twin import Twin
-from experiments.reporting.charts import COLOURS, new_figure
-
-__all__ = ["agreement_figure", "coverage_figure", "drift_figure", "fit_figure", "twin_figure"]
-
-Array = NDArray[np.float64]
+from experiments.reporting.charts import COLOURS, Array, new_figure
 
 DATA, MODEL, PUMP, REJECTED, UNUSED = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[3], "#a9b4bf"
 ESTIMATOR, MARK = PUMP, REJECTED
@@ -128,22 +124,32 @@ def drift_figure(result: Calibration, title: str) -> Figure:
 
 def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list[Parameter | None]) -> list[float]:
     """Draw the estimates with their intervals; return the middles (h) of segments with an estimate."""
-    known = [(s, v) for s, v in zip(segments, values, strict=True) if v is not None]
-    if not known:
-        ax.text(0.5, 0.5, "not identifiable in any segment", transform=ax.transAxes, ha="center", color="0.4")
-        return []
-    middle = np.array([s.middle_min / 60 for s, _ in known])
-    value, low, high = np.array([(v.value, v.low, v.high) for _, v in known]).T
-    across = np.array([0.5 * (time[s.end - 1] - time[s.first]) for s, _ in known])
-    down, up = np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)
-    ax.errorbar(
-        middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
-        label="segment alone, 95 % interval",
-    )  # fmt: skip
-    margin = 0.15 * max(value.max() - value.min(), 0.05 * abs(float(value.mean())))
-    least, most = value.min() - 1.1 * np.median(down) - margin, value.max() + 1.1 * np.median(up) + margin
-    ax.set_ylim(least, most + 0.2 * (most - least))  # one wide interval must not flatten the rest; the legend has room
+    spans = [(s.middle_min / 60, 0.5 * (time[s.end - 1] - time[s.first])) for s in segments]
+    middle, value, low, high = _alone(ax, spans, values)
+    if len(middle):
+        margin = 0.15 * max(value.max() - value.min(), 0.05 * abs(float(value.mean())))
+        down, up = np.median(np.maximum(value - low, 0.0)), np.median(np.maximum(high - value, 0.0))
+        least, most = value.min() - 1.1 * down - margin, value.max() + 1.1 * up + margin
+        ax.set_ylim(
+            least, most + 0.2 * (most - least)
+        )  # one wide interval must not flatten the rest; a legend has room
     return [float(m) for m in middle]
+
+
+def _alone(ax: Axes, spans: Sequence[tuple[float, float]], found: Sequence[Parameter | None]) -> Array:
+    """Draw the estimate of each segment, fitted alone; return middle (h), value, low and high of those known, (4, K).
+
+    Args: spans: middle and half length of each segment, h.
+    """
+    known = [(*span, p.value, p.low, p.high) for span, p in zip(spans, found, strict=True) if p is not None]
+    middle, across, value, low, high = np.array(known).reshape(-1, 5).T
+    if known:
+        down, up = np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)
+        style: dict[str, Any] = {"ms": 5, "color": DATA, "elinewidth": 1.1, "capsize": 2.5}
+        ax.errorbar(middle, value, [down, up], across, "o", label="segment alone, 95 % interval", **style)
+    else:
+        ax.text(0.5, 0.5, "not identifiable in any segment", transform=ax.transAxes, ha="center", color="0.4")
+    return np.array([middle, value, low, high])
 
 
 def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: str) -> Figure:
@@ -251,18 +257,10 @@ def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervise
 def _compared(ax: Axes, c: Compared, label: str) -> None:
     """Draw a parameter's segments with their intervals over the model's value."""
     ax.axhline(c.expected, color="black", lw=1.0, ls="--", label="model")
-    known = [(a / 60, b / 60, p) for a, b, p in zip(c.first_min, c.end_min, c.found, strict=True) if p is not None]
-    if known:
-        middle = np.array([0.5 * (a + b) for a, b, _ in known])
-        value, low, high = np.array([(p.value, p.low, p.high) for _, _, p in known]).T
-        ax.errorbar(
-            middle, value, yerr=[np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)],
-            xerr=[0.5 * (b - a) for a, b, _ in known], fmt="o", ms=4.5, color=DATA, elinewidth=1.1, capsize=2.5,
-            label="segment alone, 95 %",
-        )  # fmt: skip
-        ends = np.concatenate([value, [c.expected]])
+    spans = [((a + b) / 120, (b - a) / 120) for a, b in zip(c.first_min, c.end_min, strict=True)]
+    middle, value, low, high = _alone(ax, spans, c.found)
+    if len(middle):
+        ends = np.append(value, c.expected)
         spread = max(1.5 * float(np.ptp(ends)), 2.0 * float(np.median(high - low)), 0.1 * c.expected)
         ax.set_ylim(max(ends.mean() - spread, 0.0), ends.mean() + spread)  # one wide interval must not flatten the rest
-    else:
-        ax.text(0.5, 0.5, "not identifiable in any segment", transform=ax.transAxes, ha="center", color="0.4")
     ax.set_ylabel(label)

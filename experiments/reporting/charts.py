@@ -17,11 +17,6 @@ from numpy.typing import NDArray
 
 from experiments.reporting.tables import clock
 
-__all__ = [
-    "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "pump_end", "relative_map",
-    "relative_trajectories", "save", "trajectories",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f", "#000000")
@@ -61,7 +56,7 @@ def save(figure: Figure, folder: Path, name: str) -> Path:
     return folder / f"{name}.png"
 
 
-def _plain(axis: Axis) -> None:
+def plain(axis: Axis) -> None:
     """Write 0.01 instead of a power of ten at ticks of a logarithmic axis, because superscripts are slow to draw."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(_Plain(labelOnlyBase=False))
@@ -109,8 +104,8 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
         right.axvline(best_step[0], color=COLOURS[2], linewidth=1, linestyle="--", label="policy kept")
     right.set(xlabel="environment step", ylabel="regret against the optimum, %", yscale="log")
     right.set_title("Greedy policy on the selection grid")
-    _plain(left.yaxis)
-    _plain(right.yaxis)
+    plain(left.yaxis)
+    plain(right.yaxis)
     right.legend()
     return figure
 
@@ -120,18 +115,32 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
 
     Args: od (X,), setpoint (Y,), learned and optimal (Y, X) in mL/s.
     """
+    most, ends = max(20.0, 1000.0 * float(learned.max()), 1000.0 * float(optimal.max())), setpoint[[0, -1]]
+    labels = "OD x", "setpoint, OD", "pump rate, µL/s"
+    return _maps(od, setpoint, (1000.0 * learned, 1000.0 * optimal), most, (ends, ends), labels)
+
+
+def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> Figure:
+    """Draw the learned and the optimal fraction of the largest pump rate over error and growth share.
+
+    Args: error (X,), periods of full pump; share (Y,); learned and optimal (Y, X), 0 to 1.
+    """
+    labels = "error e, periods of full pump", "growth's share of the pump, s", "dose, share of full pump"
+    return _maps(error, share, (learned, optimal), 1.0, (np.zeros(2), share[[0, -1]]), labels)
+
+
+def _maps(
+    x: Array, y: Array, levels: tuple[Array, Array], most: float, target: tuple[Array, Array],
+    labels: tuple[str, str, str],
+) -> Figure:  # fmt: skip
     figure, axes = new_figure(9.0, 3.6, 1, 2, sharey=True)
-    most = max(20.0, 1000.0 * float(learned.max()), 1000.0 * float(optimal.max()))
-    for ax, rate, title in zip(
-        axes, (learned, optimal), ("learned policy", "optimum (dynamic programming)"), strict=True
-    ):
-        mesh = ax.pcolormesh(od, setpoint, rate * 1000.0, cmap="viridis", vmin=0.0, vmax=most, rasterized=True)
-        ax.plot([setpoint[0], setpoint[-1]], [setpoint[0], setpoint[-1]], color="white", linewidth=1, linestyle="--")
-        ax.set(xlabel="OD x")
-        ax.set_title(title)
+    for ax, level, title in zip(axes, levels, ("learned policy", "optimum (dynamic programming)"), strict=True):
+        mesh = ax.pcolormesh(x, y, level, cmap="viridis", vmin=0.0, vmax=most, rasterized=True)
+        ax.plot(*target, color="white", linewidth=1, linestyle="--")
+        ax.set(xlabel=labels[0], title=title)
         ax.grid(False)
-    axes[0].set_ylabel("setpoint, OD")
-    figure.colorbar(mesh, ax=axes, label="pump rate, µL/s")
+    axes[0].set_ylabel(labels[1])
+    figure.colorbar(mesh, ax=axes, label=labels[2])
     return figure
 
 
@@ -142,42 +151,10 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
       minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
       rates, best_rates: pump rates in mL/s, (K, G).
     """
-    goals, (unit, sign) = np.unique(setpoint), clock(minutes[-1])
-    time = minutes / unit
-    figure, axes = new_figure(3.4 * goals.size, 4.6, 2, goals.size, sharex=True, sharey="row", height_ratios=[2, 1])
-    for column, goal in enumerate(goals):
-        top, bottom = axes[column], axes[goals.size + column]
-        top.axhline(goal, color="black", linewidth=0.8, linestyle="--", label="setpoint")
-        for k, g in enumerate(np.flatnonzero(setpoint == goal)):
-            top.plot(time, od[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {od[0, g]:g}")
-            top.plot(time, best[:, g], color="black", linewidth=1.0, linestyle=":", label="optimum" if k == 0 else None)
-            bottom.step(time[:-1], rates[:, g] * 1000.0, where="post", color=COLOURS[k], linewidth=1.0)
-            bottom.step(time[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":")
-        top.set_title(f"setpoint {goal:g}")
-        bottom.set(xlabel=f"time, {sign}", ylim=(-0.5, pump_end(rates, best_rates)))
-    axes[0].legend()
-    axes[0].set_ylabel("OD")
-    axes[goals.size].set_ylabel("pump rate, µL/s")
-    return figure
-
-
-def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> Figure:
-    """Draw the learned and the optimal fraction of the largest pump rate over error and growth share.
-
-    Args: error (X,), periods of full pump; share (Y,); learned and optimal (Y, X), 0 to 1.
-    """
-    figure, axes = new_figure(9.0, 3.6, 1, 2, sharey=True)
-    for ax, level, title in zip(
-        axes, (learned, optimal), ("learned policy", "optimum (dynamic programming)"), strict=True
-    ):
-        mesh = ax.pcolormesh(error, share, level, cmap="viridis", vmin=0.0, vmax=1.0, rasterized=True)
-        ax.axvline(0.0, color="white", linewidth=1, linestyle="--")
-        ax.set(xlabel="error e, periods of full pump")
-        ax.set_title(title)
-        ax.grid(False)
-    axes[0].set_ylabel("growth's share of the pump, s")
-    figure.colorbar(mesh, ax=axes, label="dose, share of full pump")
-    return figure
+    unit, sign = clock(minutes[-1])
+    labels, end = ("OD", "pump rate, µL/s", f"time, {sign}"), (-0.5, pump_end(rates, best_rates))
+    series = minutes / unit, od, best, 1000.0 * rates, 1000.0 * best_rates
+    return _loops(series, setpoint, "setpoint {:g}", labels, end, target=True)
 
 
 def relative_trajectories(error: Array, best: Array, share: Array, levels: Array, best_levels: Array) -> Figure:
@@ -185,21 +162,34 @@ def relative_trajectories(error: Array, best: Array, share: Array, levels: Array
 
     Args: error, best: e including the start, (K + 1, G). share: (G,). levels, best_levels: (K, G), 0 to 1.
     """
-    shares = np.unique(share)
-    figure, axes = new_figure(3.4 * shares.size, 4.6, 2, shares.size, sharex=True, sharey="row", height_ratios=[2, 1])
+    labels = "error e, periods of full pump", "dose, share of full pump", "control periods"
     shown = 40  # periods; later the loop is at rest
-    for column, each in enumerate(shares):
-        top, bottom = axes[column], axes[shares.size + column]
-        for k, g in enumerate(np.flatnonzero(share == each)):
-            top.plot(error[:shown, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {error[0, g]:g}")
-            top.plot(best[:shown, g], color="black", linewidth=1.0, linestyle=":", label=None if k else "optimum")
-            bottom.step(range(shown), levels[:shown, g], where="post", color=COLOURS[k], linewidth=1.0)
-            bottom.step(range(shown), best_levels[:shown, g], "k:", where="post", linewidth=0.8)
-        top.set_title(f"growth takes {each:g} of the pump")
-        bottom.set(xlabel="control periods", ylim=(-0.03, 1.03))
+    series = (np.arange(shown), *(each[:shown] for each in (error, best, levels, best_levels)))
+    return _loops(series, share, "growth takes {:g} of the pump", labels, (-0.03, 1.03))
+
+
+def _loops(
+    series: Sequence[Any], group: Array, title: str, labels: tuple[str, str, str], end: tuple[float, float],
+    target: bool = False,
+) -> Figure:  # fmt: skip
+    """Draw time, state, the optimum's, action and the optimum's, a column per value of `group`, the state's target."""
+    time, state, best, action, best_action = series
+    groups, until = np.unique(group), time[: len(action)]
+    figure, axes = new_figure(3.4 * groups.size, 4.6, 2, groups.size, sharex=True, sharey="row", height_ratios=[2, 1])
+    for column, value in enumerate(groups):
+        top, bottom = axes[column], axes[groups.size + column]
+        if target:
+            top.axhline(value, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+        for k, g in enumerate(np.flatnonzero(group == value)):
+            top.plot(time, state[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {state[0, g]:g}")
+            top.plot(time, best[:, g], color="black", linewidth=1.0, linestyle=":", label=None if k else "optimum")
+            bottom.step(until, action[:, g], where="post", color=COLOURS[k], linewidth=1.0)
+            bottom.step(until, best_action[:, g], where="post", color="black", linewidth=0.8, linestyle=":")
+        top.set_title(title.format(value))
+        bottom.set(xlabel=labels[2], ylim=end)
     axes[0].legend()
-    axes[0].set_ylabel("error e, periods of full pump")
-    axes[shares.size].set_ylabel("dose, share of full pump")
+    axes[0].set_ylabel(labels[0])
+    axes[groups.size].set_ylabel(labels[1])
     return figure
 
 
@@ -252,8 +242,7 @@ def closed_loop(
             label=["not believed", *[None] * (len(names) - 1)],
         )  # fmt: skip
         axes[0].set_ylim(low, high)
-    axes[0].set_ylabel("OD")
-    axes[0].set_title(title)
+    axes[0].set(ylabel="OD", title=title)
     axes[0].legend(ncols=3)
     axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, pump_end(rate)))
     if temperature is not None:

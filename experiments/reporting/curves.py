@@ -7,12 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = [
-    "BAND", "CALLED", "COLUMNS", "CURVES", "DEPLOYMENT", "ERROR_UNITS", "METRICS", "PAGES", "PARAMETERS", "PICTURES",
-    "POPULATION", "TRAINING", "Chart", "Column", "Curve", "add", "described", "error_tag", "line", "of_population",
-    "signals_in",
-]  # fmt: skip
-
 ERROR_UNITS = {"density": "OD", "relative": "periods of full pump"}
 """Task -> unit of its steady error; a guest adds its own."""
 BAND = 0.05  # of the setpoint: the band in which a culture counts as settled

@@ -17,14 +17,12 @@ import yaml  # type: ignore[import-untyped]
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from experiments.cli.files import given
+from experiments.cli.start import version
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Emphasis, Table, number, typeset
 from experiments.reporting.verdict import Headline, verdict
 
-__all__ = ["Page", "flat", "of_runs", "provenance", "save"]
-
-PACKAGE = "turbidostat-dqn"
 HERE = Path(__file__).parent
 PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, pattern of its content
 
@@ -93,16 +91,6 @@ class Page:
         return templates.get_template("report.html.j2").render(page=self)
 
 
-def _version() -> str:
-    """Return the version of this package; from pyproject.toml if it is not installed."""
-    try:
-        return metadata.version(PACKAGE)
-    except metadata.PackageNotFoundError:
-        source = HERE.parents[1] / "pyproject.toml"
-        found = re.search(r'^version = "([^"]+)"', source.read_text(encoding="utf-8"), re.MULTILINE)
-        return found[1] if found else "unknown"
-
-
 def _other_versions() -> str:
     found = [f"Python {platform.python_version()}"]
     for name in ("numpy", "scipy", "torch", "matplotlib"):
@@ -121,7 +109,8 @@ def provenance(page: Page, run: Path) -> None:
     pairs = [("run folder", run.name), ("overrides", _near(" ".join(given(run))) or "none")]
     if seed:
         pairs.append(("seed", seed[1]))
-    pairs += [(PACKAGE, _version()), ("with", _other_versions())]
+    name, release = version().split(" ")
+    pairs += [(name, release), ("with", _other_versions())]
     page.add("keys", pairs=pairs)
     if text:
         page.add("folded_text", heading="Configuration, every value", text=_near(text))
@@ -148,7 +137,6 @@ def _config(text: str) -> Mapping[str, Any]:
 
 
 def _near(text: str) -> str:
-    """Shorten a path: relative to the working folder, or its last two names."""
 
     def short(match: re.Match[str]) -> str:
         path = Path(match[0])
@@ -184,14 +172,12 @@ def _show(value: Any) -> str:
 
 
 def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
-    """Read summary.json of a run folder, and its configuration."""
     path = run / "config.yaml"
     config = _config(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
 
 
 def _told(runs: Iterable[Path]) -> list[Headline]:
-    """List the verdicts of the runs."""
     found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
     return [said for said in found if said is not None]
 
@@ -219,7 +205,6 @@ def _results(page: Page, run: Path, prefix: str) -> None:
 
 
 def _figures(page: Page, run: Path) -> None:
-    """Every figure of a run folder."""
     for path in (p for folder in (run / "figures", run) for p in sorted(folder.glob("*.*"))):
         if path.suffix == ".svg" or (path.suffix == ".png" and not path.with_suffix(".svg").exists()):
             page.figure(path, path.stem.replace("_", " "))
@@ -233,7 +218,7 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     Args: after: adds further parts of a run; called with the run and its name on a page of several.
     """
     name = folder.resolve()
-    page = Page(f"{name.parent.name}, {name.name}", f"{PACKAGE} {_version()}")
+    page = Page(f"{name.parent.name}, {name.name}", version())
     labels = {re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else "": run for run in runs}
     if len(labels) < len(runs):
         labels = {run.name: run for run in runs}

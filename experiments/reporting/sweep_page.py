@@ -1,15 +1,26 @@
 """One page that compares the configurations of a sweep, with its tables as CSV."""
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from experiments.reporting import charts, sweep_charts
-from experiments.reporting.page import Page
-from experiments.reporting.sweep_results import MERIT, Configuration, Result, configurations, curve, label, statistics
-from experiments.reporting.tables import Emphasis, Table, number
+import numpy as np
+from matplotlib.figure import Figure
 
-__all__ = ["of_sweep", "repeats"]
+from experiments.reporting import charts
+from experiments.reporting.page import Page
+from experiments.reporting.sweep_results import (
+    MERIT,
+    Array,
+    Configuration,
+    Result,
+    configurations,
+    curve,
+    label,
+    number_or_text,
+    statistics,
+)  # fmt: skip
+from experiments.reporting.tables import Emphasis, Table, interquartile_mean, number
 
 LONG = 40  # characters of a name, beyond which its row number is shown
 DRAWN = 8  # configurations in a figure, one per colour; the table has all
@@ -33,7 +44,6 @@ def _measures(ranked: Sequence[Configuration]) -> list[str]:
 
 
 def _cells(one: Configuration, name: str) -> list[str]:
-    """Format n, median, interquartile mean, its interval, worst."""
     if name not in one.measured:
         return ["–"] * len(STATISTICS)
     s = statistics(one.measured[name])
@@ -58,14 +68,6 @@ def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str],
     rows = tuple(_row(k + 1, one, names) for k, one in enumerate(ranked))
     columns = ("#", *ranked[0].values, *(f"{name}: {what}" for name in names for what in STATISTICS))
     page.table(Table("configurations", "All measures", columns, rows), folded="All measures in one table")
-
-
-def number_or_text(value: str) -> str:
-    """Format a number to four digits, anything else as it stands."""
-    try:
-        return number(float(value), 4)
-    except ValueError:
-        return value
 
 
 def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: Callable[[str], str]) -> str:
@@ -93,7 +95,6 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
 
 
 def _missing(page: Page, jobs: Sequence[Result], again: str) -> None:
-    """Name the jobs without results."""
     left = [job for job in jobs if job.state != "finished"]
     if not left:
         return
@@ -116,12 +117,12 @@ def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: 
         curves = [(key, steps, each) for key, steps, each in curves if each.size]
         if curves:
             name = tag.partition("/")[2]
-            figure = sweep_charts.learning_curves(curves, called(name))
+            figure = learning_curves(curves, called(name))
             path = charts.save(figure, folder / "figures", f"learning_{name}").with_suffix(".svg")
             page.figure(path, f"Greedy policy on the selection grid: {called(name)}", note)
     for name in _measures(ranked):
         measured = {key: one.measured[name] for key, one in shown.items() if name in one.measured}
-        path = charts.save(sweep_charts.values(measured, called(name)), folder / "figures", f"values_{name}")
+        path = charts.save(values(measured, called(name)), folder / "figures", f"values_{name}")
         page.figure(path.with_suffix(".svg"), f"Every value: {called(name)}", f"{note} Bar: interquartile mean.")
 
 
@@ -147,3 +148,40 @@ def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> 
         _figures(page, folder, ranked, called)
     _missing(page, jobs, again)
     return page
+
+
+def learning_curves(curves: Sequence[tuple[str, Array, Array]], quantity: str) -> Figure:
+    """Draw the interquartile mean over seeds as a line, the worst seed dashed, a colour per configuration.
+
+    Args: curves: name, steps (K,), values (K, S). quantity: with its unit.
+    """
+    figure, (ax,) = charts.new_figure(9.0, 4.0 + 0.12 * len(curves))
+    for k, (name, steps, each) in enumerate(curves):
+        colour, floor = charts.COLOURS[k % len(charts.COLOURS)], np.maximum(each, 1e-4)
+        middle, called = [interquartile_mean(row) for row in floor], f"{name} (n = {each.shape[1]})"
+        ax.plot(steps, middle, color=colour, linewidth=1.6, label=called)
+        ax.plot(steps, np.nanmax(floor, axis=1), color=colour, linewidth=0.9, linestyle="--")
+    ax.plot([], [], color="black", linewidth=1.6, label="line: interquartile mean over seeds")
+    ax.plot([], [], color="black", linewidth=0.9, linestyle="--", label="dashed: worst seed")
+    ax.set(xlabel="environment step", ylabel=quantity, yscale="log")
+    charts.plain(ax.yaxis)
+    figure.legend(loc="outside lower left", ncols=1 if max(len(c[0]) for c in curves) > 40 else 2)
+    return figure
+
+
+def values(measured: Mapping[str, Array], quantity: str) -> Figure:
+    """Draw a row per configuration, the best on top: a dot per seed or reactor, a bar at the interquartile mean.
+
+    Args: measured: name -> (n,). quantity: with its unit.
+    """
+    figure, (ax,) = charts.new_figure(9.0, 1.2 + 0.3 * len(measured))
+    for row, each in enumerate(measured.values()):
+        ax.plot(each, np.full(each.size, row), "o", color=charts.COLOURS[0], alpha=0.5, markersize=5, markeredgewidth=0)
+        ax.plot([interquartile_mean(each)] * 2, [row - 0.3, row + 0.3], color=charts.COLOURS[1], linewidth=2)
+    ax.set(xlabel=quantity, ylim=(len(measured) - 0.4, -0.6))
+    every = np.concatenate(list(measured.values()))
+    if every.min() > 0.0 and every.max() > 30.0 * every.min():
+        ax.set_xscale("log")
+        charts.plain(ax.xaxis)
+    ax.set_yticks(range(len(measured)), list(measured), fontsize=8)
+    return figure

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.reporting.curves import ERROR_UNITS
-
-__all__ = ["Configuration", "Result", "Statistics", "configurations", "curve", "label", "measures", "statistics"]
+from experiments.reporting.tables import interquartile_mean, number
 
 Array = NDArray[np.float64]
 RESAMPLES = 2000
@@ -51,15 +50,14 @@ class Configuration:
     @property
     def name(self) -> str:
         """Name in a figure."""
-        return (
-            ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in self.values.items()) or "all jobs"
-        )
+        varied = (f"{key.rpartition('.')[2]} {number_or_text(value)}" for key, value in self.values.items())
+        return ", ".join(varied) or "all jobs"
 
 
-def _short(value: str) -> str:
-    """Format a number to four digits."""
+def number_or_text(value: str) -> str:
+    """Format a number to four digits, anything else as it stands."""
     try:
-        return f"{float(value):.4g}"
+        return number(float(value), 4)
     except ValueError:
         return value
 
@@ -83,8 +81,8 @@ def statistics(values: Array) -> Statistics:
     if values.size > 1:
         drawn = np.random.default_rng(0).choice(values, (RESAMPLES, values.size))
         low, high = np.percentile(trim_mean(drawn, 0.25, axis=1), [2.5, 97.5])
-    middle = float(trim_mean(values, 0.25))
-    return Statistics(values.size, float(np.median(values)), middle, (float(low), float(high)), float(values.max()))
+    middle, interval = interquartile_mean(values), (float(low), float(high))
+    return Statistics(values.size, float(np.median(values)), middle, interval, float(values.max()))
 
 
 def label(measure: str, task: str, command: str) -> str:

@@ -10,6 +10,7 @@ import csv
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,7 @@ from conf.presets import groups
 from experiments.cli.files import given
 from experiments.cli.stop import undisturbed
 from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
-
-__all__ = ["Events", "PopulationWriter", "interquartile_mean"]
+from experiments.reporting.tables import interquartile_mean
 
 MOST_CURVES = 64  # a larger population gets only its statistics
 LIVE_S = 5.0  # time until written values are visible
@@ -66,7 +66,6 @@ class Events:
             self.flush()
 
     def _point(self, tag: str, number: float) -> Summary.Value:
-        """Build a value; the first of a tag has its description."""
         point = Summary.Value(tag=tag, tensor=TensorProto(dtype=DT_FLOAT, float_val=[number], tensor_shape=NUMBER))
         if tag not in self._known:
             self._known.add(tag)
@@ -77,19 +76,19 @@ class Events:
         """Write one point of each curve. Args: values: by tag. wall: s since 1970, if not now."""
         self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
+    def _strings(self, tag: str, values: list[bytes], shape: Any, metadata: Any, step: int) -> None:
+        tensor = TensorProto(dtype=DT_STRING, string_val=values, tensor_shape=shape)
+        self._add([Summary.Value(tag=tag, tensor=tensor, metadata=metadata)], step)
+
     def picture(self, tag: str, png: Path, step: int) -> None:
         """Write a PNG file under TensorBoard's images. Raises: OSError for an unreadable file."""
         data = png.read_bytes()
         size = [str(int.from_bytes(data[i : i + 4], "big")).encode() for i in (16, 20)]  # width and height
-        shown = TensorProto(dtype=DT_STRING, string_val=[*size, data], tensor_shape=THREE)
-        said = image.create_summary_metadata("", described(tag))
-        self._add([Summary.Value(tag=tag, tensor=shown, metadata=said)], step)
+        self._strings(tag, [*size, data], THREE, image.create_summary_metadata("", described(tag)), step)
 
     def text(self, tag: str, markdown: str, step: int = 0) -> None:
         """Write a text in Markdown."""
-        said = text.create_summary_metadata("", "")
-        line = TensorProto(dtype=DT_STRING, string_val=[markdown.encode()], tensor_shape=LINE)
-        self._add([Summary.Value(tag=tag, tensor=line, metadata=said)], step)
+        self._strings(tag, [markdown.encode()], LINE, text.create_summary_metadata("", ""), step)
 
     def layout(self, categories: Mapping[str, Mapping[str, Chart]]) -> None:
         """Write the layout of the custom page: category -> title -> chart."""
@@ -99,9 +98,8 @@ class Events:
                 for name, charts in categories.items()
             ]
         )
-        line = TensorProto(dtype=DT_STRING, string_val=[made.SerializeToString()], tensor_shape=NUMBER)
-        said = custom.create_summary_metadata()
-        self._add([Summary.Value(tag=custom.CONFIG_SUMMARY_TAG, tensor=line, metadata=said)], 0)
+        tag, said = custom.CONFIG_SUMMARY_TAG, custom.create_summary_metadata()
+        self._strings(tag, [made.SerializeToString()], NUMBER, said, 0)
 
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
         """Write a row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
@@ -132,13 +130,11 @@ class Events:
         self._add(summary_v2.hparams_pb({_ordered(key): values[key] for key in values}, trial_id=name).value, 0)
 
     def flush(self) -> None:
-        """Make everything so far visible to a reader."""
         with undisturbed():
             self._writer.flush()
         self._flushed = time.monotonic()
 
     def close(self) -> None:
-        """Flush and close. Idempotent."""
         with undisturbed():
             self._writer.close()
 
@@ -152,7 +148,6 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
 
 
 def _varied(folder: Path) -> dict[str, str]:
-    """Return the values of a run's command line by key, without presets and folders."""
     words = (word.partition("=") for word in given(folder))
     found = {key: value for key, sign, value in words if sign and key not in groups() and key != "seed"}
     return {k: v for k, v in found.items() if not k.startswith(("hydra.", "hydra/", "~")) and k != "extend"}
@@ -173,13 +168,6 @@ def _ordered(key: str) -> str:
 def _column(key: str, column: Column) -> api_pb2.HParamInfo:
     kind = api_pb2.DATA_TYPE_FLOAT64 if column.number else api_pb2.DATA_TYPE_STRING
     return api_pb2.HParamInfo(name=_ordered(key), display_name=column.title, description=column.what, type=kind)
-
-
-def interquartile_mean(values: NDArray[np.float64]) -> float:
-    """Return the mean of the middle half (Agarwal 2021); robust like the median, and smoother over few seeds."""
-    finite = np.sort(values[np.isfinite(values)])
-    cut = finite.size // 4
-    return float(finite[cut : finite.size - cut].mean()) if finite.size else float("nan")
 
 
 class PopulationWriter:
@@ -210,7 +198,6 @@ class PopulationWriter:
         return self._agents if len(self._seeds) > 1 else [self.events]
 
     def _rows_until(self, step: int) -> list[list[str]]:
-        """Return earlier rows of steps that are in the checkpoint."""
         if not self._path.is_file():
             return []
         with open(self._path, newline="", encoding="utf-8") as f:
@@ -242,13 +229,11 @@ class PopulationWriter:
                 events.scalars(own, step)
 
     def flush(self) -> None:
-        """Make everything so far visible to a reader."""
         self._file.flush()
         for events in (self.events, *self._agents):
             events.flush()
 
     def close(self) -> None:
-        """Flush and close. Idempotent."""
         self._file.close()
         for events in (self.events, *self._agents):
             events.close()

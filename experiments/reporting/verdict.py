@@ -10,8 +10,6 @@ import numpy as np
 from experiments.reporting.curves import BAND, CALLED, ERROR_UNITS, signals_in
 from experiments.reporting.tables import count, number
 
-__all__ = ["REMEDY", "Headline", "verdict"]
-
 Summary = Mapping[str, Any]
 REGRET, STEADY = 0.5, 0.003
 """Per cent and OD that `env=sim` aims for (experiments/training/density.py); half a per cent is not seen in a

@@ -1,19 +1,21 @@
-"""Kinds of agents: `build` makes agents from their config, `add` registers another kind."""
+"""Agents in their environments: `build` makes agents of a registered kind, `population` groups of them that train."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from conf import presets
 from conf.messages import NameTaken
 from dqn.agent import STREAMS, DQNAgent
 from dqn.config import DQNConfig
-from dqn.trainer import Agent
+from dqn.network import QNetwork
+from dqn.population import GROUP, Population
+from dqn.trainer import Agent, Trainer
 from experiments.training.config import AGENTS
+from experiments.training.evaluation import Act
 from experiments.training.tasks import Task
-
-__all__ = ["Streams", "add", "build", "names"]
 
 PARTS = (
     "config", "network", "n_agents", "steps", "updates", "act", "observe", "curves", "state_dict", "load_state_dict",
@@ -68,11 +70,6 @@ def add(
     AGENTS[kind], KINDS[config] = config, AgentKind(make, tuple(streams))
 
 
-def names(config: Any) -> tuple[str, ...]:
-    """Return the names of the streams that agents of this config need."""
-    return KINDS[type(config)].streams
-
-
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
     """Make one agent per seed of each stream.
 
@@ -82,3 +79,38 @@ def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Age
     if missing := [part for part in PARTS if not hasattr(made, part)]:
         raise ValueError(f"agent {config.kind} has no {', '.join(missing)} (docs/extending.md, An agent)")
     return made
+
+
+def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.random.SeedSequence]]:
+    """Make for each name one SeedSequence per seed, independent of the other names and seeds.
+
+    The stream of a name depends on its seed and its place in `names` only, so agent i of a population has the same
+    streams as a single agent with its seed. Append new names at the end.
+    """
+    spawned = [np.random.SeedSequence(seed).spawn(len(names)) for seed in seeds]
+    return {name: [children[k] for children in spawned] for k, name in enumerate(names)}
+
+
+def population(
+    task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
+) -> Population:
+    """Make agents with the given seeds in groups of a suitable size; arguments as `Population`."""
+    size = GROUP if device == "cpu" else len(seeds)
+    groups = [seeds[k : k + size] for k in range(0, len(seeds), size)]
+    return Population([trainer(task, agent, group, device) for group in groups], threads)
+
+
+def trainer(task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu") -> Trainer:
+    """Make one group of agents with the given seeds, each with its own environment; one record per episode."""
+    own = streams(seeds, (*KINDS[type(agent)].streams, "env"))
+    return Trainer(task.copies(own["env"]), build(agent, task, own, device), interval=task.episode_steps)
+
+
+def act_with(network: QNetwork, flat: torch.Tensor) -> Act:
+    """Turn weights (S, P) into greedy policies on NumPy grids."""
+    network = network.with_weights(flat)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        return network(torch.from_numpy(observation.astype(np.float32)).to(flat.device)).argmax(-1).cpu().numpy()
+
+    return act

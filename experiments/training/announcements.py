@@ -6,22 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.cli.files import choices
 from experiments.reporting import tables
 from experiments.reporting.curves import TRAINING, of_population
 from experiments.reporting.tensorboard import PopulationWriter
+from experiments.reporting.verdict import Headline
 from experiments.training import tasks
 from experiments.training.config import TrainConfig
-from experiments.training.evaluation import Score
+from experiments.training.evaluation import Array, Score
 from experiments.training.tasks import Task
 
-__all__ = ["began", "ended", "progress", "results", "show"]
-
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 
 def _seeds(seeds: Sequence[int]) -> str:
@@ -54,34 +50,18 @@ def progress(step: int, total: int, seconds: float, score: Score, best: tuple[Ar
     return f"{100 * step // total} %, {clock}: selection grid: {now}; kept: {_pair(*best, task.unit)}"
 
 
-def _verdict(score: Score, task: Task) -> str:
-    """Describe which of the two limits all agents meet."""
-    good = score.regret_pct.max() <= task.regret_unit, score.steady_abs_error.max() <= task.steady_unit
-    words = ["within" if holds else "beyond" for holds in good]
-    limits = f"{task.regret_unit:g} % regret", f"{task.steady_unit:g} {task.unit} at rest"
-    if all(good):
-        return f"within the limits of {limits[0]} and {limits[1]}"
-    return f"{words[0]} the limit of {limits[0]}, {words[1]} that of {limits[1]}"
-
-
 def ended(
-    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, words: str = "",
+    folder: Path, task: Task, kept: Score, told: Headline | None, spent: str, path: Path, words: str = "",
     whole: bool = True,
 ) -> None:  # fmt: skip
-    """Log the result, its comparison, and the next step.
+    """Log the result and the next step.
 
-    Args: spent: steps, updates and time, as text. words: of the next command line. whole: the training did all its
-    steps.
+    Args: told: as on the run's page. spent: steps, updates and time, as text. words: of the next command line. whole:
+    the training did all its steps.
     """
-    many = kept.regret_pct.size > 1
-    worst = f"; the worst of {kept.regret_pct.size}: {kept.regret_pct.max():.2f} %, {kept.steady_abs_error.max():.4f}"
-    reached = _pair(kept.regret_pct, kept.steady_abs_error, task.unit)
     log.info("%s", spent)
-    log.info("reached on the reported grid: %s%s: %s", reached, worst if many else "", _verdict(kept, task))
-    log.info(
-        "for comparison, the one-line controller: %s",
-        _pair(np.abs(myopic.regret_pct), myopic.steady_abs_error, task.unit),
-    )
+    for line in () if told is None else filter(None, (*told.items, told.remark)):
+        log.info("%s", line)
     log.info("policy %s; figures %s", path, folder / "figures")
     if task.tried:
         file = shlex.quote(str(path))

@@ -12,8 +12,6 @@ from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 
-__all__ = ["AGENTS", "ENVS", "TASKS", "TrainConfig", "add", "agent_schema", "env_schema"]
-
 ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "preview": PreviewConfig}
 
 

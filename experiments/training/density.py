@@ -1,4 +1,4 @@
-"""The paper's task for a training run: from OD and setpoint to a pump rate, on a model with known mu and tau."""
+"""The paper's task for a training run: from OD and setpoint (and the next one) to a pump rate, mu and tau known."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -10,17 +10,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
-from dqn.hindsight import GoalRelabel, Relabel
-from dqn.policy import ABSOLUTE, Policy
+from dqn.hindsight import GoalRelabel, ProgramRelabel, Relabel
+from dqn.policy import ABSOLUTE, PREVIEW, Policy
 from envs.optimum import solve_episode
+from envs.preview import PreviewConfig, PreviewVectorEnv, passed, program_of
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors, tracking_reward
 from envs.vector_env import BioreactorVectorEnv
 from experiments.reporting import charts
-from experiments.training.evaluation import Rollout, each, pairs, rollout
+from experiments.training.evaluation import Array, Rollout, beside_optimum, pairs
 
-__all__ = ["DensityTask", "first_actions"]
-
-Array = NDArray[np.float64]
 COARSE = 2e-3  # of log OD, for a figure
 
 
@@ -46,13 +44,9 @@ class DensityTask:
         self._factors = step_factors(config)
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> BioreactorVectorEnv:
-        """Return the environments."""
-        env = BioreactorVectorEnv(len(seeds), self.config)
-        env.seed_streams(seeds)
-        return env
+        return BioreactorVectorEnv.seeded(self.config, seeds)
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Return the relabelling of replayed transitions with setpoints of the task."""
         setpoints = self.config.setpoints
         return GoalRelabel(agent, (min(setpoints), max(setpoints)), tracking_reward)
 
@@ -74,11 +68,9 @@ class DensityTask:
         return np.stack([od, setpoint], axis=-1), od - setpoint
 
     def asked(self, start: Array) -> Array:
-        """Return the setpoint."""
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
-        """Solve by backward induction."""
         od, setpoint = start.T
         state, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
         for s in np.unique(setpoint):
@@ -104,18 +96,13 @@ class DensityTask:
         best = self.actions[first_actions(env, x, s)].reshape(learned.shape)
         goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
         start = pairs(np.array(env.start_od), goals)
-        ours, theirs = rollout(each(policy), self, start[None]), self.best(start)
-        return {
-            "policy_map": charts.policy_map(od, setpoint, learned, best),
-            "trajectories": charts.trajectories(
-                np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
-                np.concatenate([start[:, 0][None], ours.state[:, 0]]),
-                np.concatenate([start[:, 0][None], theirs.state[:, 0]]),
-                start[:, 1],
-                self.actions[ours.action[:, 0]],
-                self.actions[theirs.action[:, 0]],
-            ),
-        }
+        return {"policy_map": charts.policy_map(od, setpoint, learned, best), **self._trajectories(policy, start)}
+
+    def _trajectories(self, policy: Policy, start: Array) -> dict[str, Figure]:
+        """Draw the OD over time from starts beside the optimum's."""
+        minutes = np.arange(self.steps + 1, dtype=np.float64) * self.config.control_min
+        ours, theirs, *rates = beside_optimum(policy, self, start)
+        return {"trajectories": charts.trajectories(minutes, ours, theirs, self.asked(start), *rates)}
 
 
 def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp]:
@@ -130,3 +117,72 @@ def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp
 
 
 _optimum = lru_cache(maxsize=16)(solve_episode)  # all grids of a run have the same setpoints
+
+
+class Preview(DensityTask):
+    """The same with the next setpoint known ahead."""
+
+    config: PreviewConfig
+    observation: tuple[str, ...] = PREVIEW
+    provable = False
+    steady_steps = 10
+    tried = ""
+
+    def __init__(self, config: PreviewConfig) -> None:
+        super().__init__(config)
+        self.description += f", the next setpoint known {config.preview_min:g} min ahead"
+        low, high = min(config.setpoints), max(config.setpoints)
+        self.limits = (
+            np.array([0.5 * SCORED_OD[0], low, low, 0.0]),
+            np.array([1.5 * SCORED_OD[1], high, high, config.preview_min]),
+        )
+
+    def copies(self, seeds: Sequence[np.random.SeedSequence]) -> PreviewVectorEnv:
+        return PreviewVectorEnv.seeded(self.config, seeds)
+
+    def hindsight(self, agent: DQNConfig) -> Relabel:
+        c = self.config
+        (least, most), (low, high) = SCORED_OD, (min(c.setpoints), max(c.setpoints))
+        return ProgramRelabel(
+            agent, lambda u: least * (most / least) ** u, lambda u: low + (high - low) * u, tracking_reward,
+            1, c.control_min, c.preview_min, scales=True,
+        )  # fmt: skip
+
+    def selection_grid(self) -> Array:
+        setpoints = np.unique(self.config.setpoints)
+        return self._changes(0.5 * (setpoints[1:] + setpoints[:-1]) if setpoints.size > 2 else setpoints)
+
+    def report_grid(self) -> Array:
+        """List changes between each two of the setpoints."""
+        return self._changes(np.unique(self.config.setpoints))
+
+    def _changes(self, setpoints: Array) -> Array:
+        """Cultures at rest when the change is announced."""
+        now, following = (a.ravel() for a in np.meshgrid(setpoints, setpoints, indexing="ij"))
+        differ = now != following
+        time = np.full(int(differ.sum()), self.config.preview_min)
+        return np.column_stack([now[differ], now[differ], following[differ], time])
+
+    def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
+        """Advance OD and program by one decision; x - setpoint."""
+        state, error = super().advance(observation, action)
+        goal = passed(self.config.control_min, observation[..., 1:])
+        return np.concatenate([state[..., :1], goal], axis=-1), error
+
+    def asked(self, start: Array) -> Array:
+        return start[:, 2]
+
+    def best(self, start: Array) -> Rollout:
+        """By backward induction over the program of each start."""
+        programs = program_of(self.config.control_min, start[:, 1:], self.steps)
+        runs = [solve_episode(self.config, p).rollout(od) for p, od in zip(programs.T, start[:, :1], strict=True)]
+        state, action = (np.stack(part, axis=-1) for part in zip(*runs, strict=True))
+        return Rollout(state, state - programs[:, None], action)
+
+    def myopic(self, observation: Array) -> NDArray[np.intp]:
+        return super().myopic(observation[..., :2])
+
+    def figures(self, policy: Policy) -> dict[str, Figure]:
+        grid = self.report_grid()
+        start = grid[np.unique(grid[:, 2], return_index=True)[1]][:: max(1, len(np.unique(grid[:, 2])) // 3)]
+        return self._trajectories(policy, start)

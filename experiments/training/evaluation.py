@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from dqn.policy import Policy
 
-__all__ = ["Act", "Evaluated", "Evaluation", "Rollout", "Score", "each", "pairs", "rollout"]
-
 Array = NDArray[np.float64]
 Act = Callable[[Array], NDArray[np.intp]]
 """Observations (S, G, O) -> action indices (S, G)."""
@@ -75,6 +73,16 @@ def each(policy: Policy) -> Act:
     return lambda observation: policy.act(observation[0])[None]
 
 
+def beside_optimum(policy: Policy, task: Any, start: Array) -> tuple[Array, Array, Array, Array]:
+    """Run a policy file and the optimum from starts (G, O).
+
+    Returns: the first number observed, with the start, (K + 1, G), and the value of the action, (K, G), of both each.
+    """
+    runs = rollout(each(policy), task, start[None]), task.best(start)
+    ours, theirs = (np.concatenate([start[:, 0][None], run.state[:, 0]]) for run in runs)
+    return ours, theirs, *(task.actions[run.action[:, 0]] for run in runs)
+
+
 def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
     """Run the noise-free closed loop of S policies from G starts. Args: act: the policies. start: (S, G, O)."""
     shape = (task.steps, *start.shape[:-1])
@@ -113,12 +121,10 @@ class Evaluation:
         return np.asarray(np.square(run.error).sum(axis=0).mean(axis=-1))
 
     def _steady(self, run: Rollout) -> Array:
-        """Return the median of each setpoint, shape (S, M)."""
         last = np.abs(run.error[-self.task.steady_steps :])
         return np.stack([np.median(last[..., there], axis=(0, 2)) for there in self._resting], axis=-1)
 
     def __call__(self, act: Act, agents: int = 1) -> Score:
-        """Score S = `agents` policies."""
         run = rollout(act, self.task, np.broadcast_to(self.start, (agents, *self.start.shape)))
         cost = self._cost(run)
         regret = 100.0 * (cost / self.optimum_cost - 1.0)

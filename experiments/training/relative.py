@@ -15,11 +15,7 @@ from dqn.policy import RELATIVE, Policy
 from envs.optimum import solve_relative
 from envs.relative import RelativeConfig, RelativeVectorEnv, nearest_level, relative_reward
 from experiments.reporting import charts
-from experiments.training.evaluation import Rollout, each, pairs, rollout
-
-__all__ = ["Relative"]
-
-Array = NDArray[np.float64]
+from experiments.training.evaluation import Array, Rollout, beside_optimum, pairs
 
 
 class Relative:
@@ -47,13 +43,9 @@ class Relative:
         self.limits = (np.array([-span, low]), np.array([span, high]))
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> RelativeVectorEnv:
-        """Return the environments."""
-        env = RelativeVectorEnv(len(seeds), self.config)
-        env.seed_streams(seeds)
-        return env
+        return RelativeVectorEnv.seeded(self.config, seeds)
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Return the relabelling: a new setpoint shifts the error."""
         return ShiftRelabel(agent, self.config.largest_error, relative_reward)
 
     def selection_grid(self) -> Array:
@@ -77,11 +69,9 @@ class Relative:
         return np.stack([error, s], axis=-1), error
 
     def asked(self, start: Array) -> Array:
-        """Return the growth share."""
         return start[:, 1]
 
     def best(self, start: Array) -> Rollout:
-        """Solve by backward induction."""
         error, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
         for s in np.unique(start[:, 1]):
             here = start[:, 1] == s
@@ -106,16 +96,10 @@ class Relative:
         best = np.stack([_optimum(self.config, float(x), self.steps).act(error, self.steps) for x in share])
         shares = np.array([0.1, 0.5, 0.9])
         start = pairs(np.array([-span, span]), shares)
-        ours, theirs = rollout(each(policy), self, start[None]), self.best(start)
+        ours, theirs, *levels = beside_optimum(policy, self, start)
         return {
             "policy_map": charts.relative_map(error, share, learned, self.actions[best]),
-            "trajectories": charts.relative_trajectories(
-                np.concatenate([start[:, 0][None], ours.state[:, 0]]),
-                np.concatenate([start[:, 0][None], theirs.state[:, 0]]),
-                start[:, 1],
-                self.actions[ours.action[:, 0]],
-                self.actions[theirs.action[:, 0]],
-            ),
+            "trajectories": charts.relative_trajectories(ours, theirs, start[:, 1], *levels),
         }
 
 

@@ -12,19 +12,18 @@ import torch
 
 from dqn import policy
 from dqn.checkpoint import CheckpointError
-from dqn.export import export
+from dqn.network import export
 from dqn.policy import Policy
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
+from experiments.reporting.verdict import verdict
 from experiments.training import announcements
 from experiments.training.config import TASKS, TrainConfig
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
-
-__all__ = ["fingerprint", "train"]
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +56,6 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 
 def _completed(config: TrainConfig) -> TrainConfig:
-    """With what the files hold that it names. Raises: UserError."""
     own = TASKS[type(config.env)].completed
     if own is not None:
         return own(config)
@@ -75,7 +73,6 @@ def _warn_of_growth(env: EnvConfig) -> None:
 
 
 def _finish(session: Session) -> None:
-    """Score on the reported grid, export, draw, write summary.json."""
     c, agents, best = session.config, session.agents, session.best
     report, kept, last = session.report()
     myopic = report(session.task.myopic)
@@ -106,13 +103,11 @@ def _finish(session: Session) -> None:
     files.write_json(session.folder / "summary.json", summary)
     announcements.results(session.writer, agents.steps, kept, session.task, session.seeds)
     spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
-    config = session.config
-    whole = config.stop_within is None
-    announcements.ended(session.folder, session.task, kept, myopic, spent, path, _repeated(config), whole)
+    told, whole = verdict(summary, asdict(c)), c.stop_within is None
+    announcements.ended(session.folder, session.task, kept, told, spent, path, _repeated(c), whole)
 
 
 def _repeated(config: TrainConfig) -> str:
-    """Words of the command line that `deploy` is to be told, too."""
     given = {key: getattr(config, key) for key in TASKS[type(config.env)].repeats}
     return " ".join(f"{key}={shlex.quote(value)}" for key, value in given.items() if value is not None)
 
@@ -150,7 +145,6 @@ def _export(session: Session, score: Score) -> tuple[Path, Policy]:
 
 
 def _figures(session: Session, exported: Policy) -> None:
-    """Draw learning curves, policy map and example trajectories, as files and in TensorBoard."""
     best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
     returns = np.array(session.returns)

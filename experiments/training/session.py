@@ -19,12 +19,10 @@ from dqn import checkpoint
 from dqn.trainer import TrainRecord
 from experiments.cli import stop
 from experiments.reporting.tensorboard import PopulationWriter
-from experiments.training import announcements, build, tasks
+from experiments.training import agents, announcements, tasks
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, Score
 from experiments.training.tasks import Task
-
-__all__ = ["BestSoFar", "Session", "merit"]
 
 log = logging.getLogger(__name__)
 
@@ -74,12 +72,10 @@ class BestSoFar:
         self.step[better], self.updates[better] = step, updates
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state, tensors and plain values."""
         kept = {name: getattr(self, name).tolist() for name in PER_AGENT}
         return {"weights": self.weights, **kept, "history": self.history}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
         self.weights.copy_(state["weights"])
         for name in PER_AGENT:
             getattr(self, name)[:] = state[name]
@@ -100,7 +96,7 @@ class Session:
         self.folder = folder
         self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
         self.task = tasks.of(config.env)
-        self.agents = build.population(self.task, config.agent, self.seeds, config.device, config.threads)
+        self.agents = agents.population(self.task, config.agent, self.seeds, config.device, config.threads)
         self.selection = Evaluation(self.task, self.task.selection_grid())
         self.best = BestSoFar.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
@@ -116,7 +112,7 @@ class Session:
     def evaluate(self, step: int) -> Score:
         """Score the greedy policies on the selection grid, keep the best, log."""
         weights = self.agents.weights()
-        score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
+        score = self.selection(agents.act_with(self.agents.network, weights), self.agents.n_agents)
         self.best.update(step, self.agents.updates, score, merit(score, self.task), weights)
         kept = {"kept/regret_pct": self.best.regret, "kept/steady_abs_error": self.best.steady}
         now = {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
@@ -152,7 +148,7 @@ class Session:
         """Score the kept policies and the last iterates on the reported grid."""
         report = Evaluation(self.task, self.task.report_grid())
         kept, last = (
-            report(build.act_with(self.agents.network, weights), self.agents.n_agents)
+            report(agents.act_with(self.agents.network, weights), self.agents.n_agents)
             for weights in (self.best.weights, self.agents.weights())
         )
         return report, kept, last

@@ -14,15 +14,11 @@ from dqn.trainer import TrainingEnv
 from envs.preview import PreviewConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
-from experiments.training.config import ENVS, TASKS, TaskKind, add
-from experiments.training.density import DensityTask
-from experiments.training.evaluation import Evaluated
-from experiments.training.preview import Preview
+from experiments.training.config import ENVS, TASKS, TaskKind
+from experiments.training.config import add as add
+from experiments.training.density import DensityTask, Preview
+from experiments.training.evaluation import Array, Evaluated
 from experiments.training.relative import Relative
-
-__all__ = ["Task", "add", "kind", "of"]
-
-Array = NDArray[np.float64]
 
 
 class Task(Evaluated, Protocol):

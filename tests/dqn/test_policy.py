@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from dqn import policy
-from dqn.export import export
-from dqn.network import QNetwork, action_basis, initial_weights
+from dqn.network import QNetwork, action_basis, export, initial_weights
 from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.numeric

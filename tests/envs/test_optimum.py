@@ -31,8 +31,8 @@ def test_cost_and_steady_error_of_the_nominal_task(evaluation):
 
 def test_starts_that_are_scored_are_known_where_training_begins_in_fewer():
     known = solve_episode(EnvConfig(start_od=(0.3, 0.5), episode_steps=2), 0.4, spacing=0.01)
-    assert np.exp(known.log_od[0]) <= 0.1
-    assert np.exp(known.log_od[-1]) >= 1.1
+    assert np.exp(known.grid[0]) <= 0.1
+    assert np.exp(known.grid[-1]) >= 1.1
 
 
 def of(law):

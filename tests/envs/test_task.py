@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.bench import Bench
-from envs.task import EnvConfig, pump_rates, step_factors
+from envs.task import EnvConfig, step_factors
 
 
 def test_action_grid_is_the_papers():
@@ -13,8 +13,8 @@ def test_action_grid_is_the_papers():
     assert rates[0] == 0.0
     assert rates[-1] == 0.02
     np.testing.assert_allclose(np.diff(rates), 0.00125)
-    with pytest.raises(ValueError, match="allowed >= 2"):
-        pump_rates(1)  # which could not stop
+    with pytest.raises(ValueError, match="n_actions"):
+        EnvConfig(n_actions=1)  # which could not stop
 
 
 @pytest.mark.parametrize(("period_s", "stale_s"), [(30.0, 70.0), (60.0, 100.0), (120.0, 160.0), (600.0, 660.0)])

@@ -19,7 +19,7 @@ from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
-from experiments.calibration.twin_file import plant_of, twin_yaml
+from experiments.calibration.result import plant_of, twin_yaml
 from experiments.laws.base import Controller
 from experiments.laws.density.baselines import Threshold, ThresholdConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig

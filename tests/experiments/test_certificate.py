@@ -161,7 +161,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     In 28 mL and growing by 0.0432 1/min it needs more than the pump has.
     """
     source = written(tmp_path / "policy.npz", laws.law())
-    wanted = WantedPolicy(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, 10.0, at_stake=True, forced=False)
+    wanted = WantedPolicy(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, at_stake=True, forced=False)
     check = policy_check(wanted)
     assert (check.ok, "performance" in check.detail, "proven to be safe" in check.detail) == (True, False, True)
     assert "proven to be safe" not in policy_check(replace(wanted, at_stake=False)).detail
@@ -348,7 +348,7 @@ def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(rel
     """
     given, bench = policy.load(relative), Bench(period_s=300.0, max_rate=0.05)
     model = EnvConfig(tau=bench.tau, control_min=5.0, max_pump_rate=0.05)
-    admit(given, relative, WantedPolicy("name", bench, model, {}, SCENARIO.setpoints, 10.0, True, False), resumed=False)
+    admit(given, relative, WantedPolicy("name", bench, model, {}, SCENARIO.setpoints, True, False), resumed=False)
     bounds = certificate.bounds(given, settings(given), relative, model)
     assert bounds is not None
     assert bounds.full_pump == pytest.approx(0.75)

@@ -317,11 +317,11 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
         return found
 
     monkeypatch.setattr(policy, "load", read_while_a_training_ends)
-    wanted = policies.WantedPolicy("latest", Bench(), EnvConfig(), {}, (), 10.0, at_stake=False, forced=False)
-    flown = policies.run_policy(wanted, tmp_path, resumed=False)
+    wanted = policies.WantedPolicy("latest", Bench(), EnvConfig(), {}, (), at_stake=False, forced=False)
+    flown, _ = policies.run_policy(wanted, tmp_path, resumed=False)
     monkeypatch.setattr(policy, "load", read)
     assert policies.find_policy("latest") == Path("runs/train/new/policy.npz")
-    resumed = policies.run_policy(wanted, tmp_path, resumed=True)
+    resumed, _ = policies.run_policy(wanted, tmp_path, resumed=True)
     for own in (flown, resumed):
         np.testing.assert_array_equal(own.biases[0], older.biases[0])
 

@@ -39,7 +39,7 @@ from experiments.comparison import figures
 from experiments.comparison.trials import Cell, DensityTrial
 from experiments.record.record import Recordings
 from experiments.record.summary import figure_of
-from experiments.reporting import calibration_charts, charts, sweep_charts
+from experiments.reporting import calibration_charts, charts, sweep_page
 from experiments.reporting.calibration_charts import agreement_figure
 from experiments.reporting.charts import COLOURS
 from hardware.storage.marks import Mark
@@ -431,14 +431,14 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         [{"controller": "pi", "plant": "p", "ratio_abs_error_mean": 0.1, "ci95": [0.09, 0.13]}]), [
         (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
     ]),
-    "curves of a sweep": (lambda: sweep_charts.learning_curves(
+    "curves of a sweep": (lambda: sweep_page.learning_curves(
         [("a", np.array(STEPS), np.array([[9.0, 4.0, 5.0, 6.0], [1.0, 2.0, 8.0, 3.0]])),
          ("b", np.array(STEPS), np.array([[7.0], [6.0]]))], "regret, %"), [
         (0, "line 0: a (n = 4)", "environment step", "regret, %", STEPS, [5.5, 2.5]),
         (0, "line 1", "environment step", "regret, %", STEPS, [9.0, 8.0]),
         (0, "line 2: b (n = 1)", "environment step", "regret, %", STEPS, [7.0, 6.0]),
     ]),
-    "values of a sweep": (lambda: sweep_charts.values(
+    "values of a sweep": (lambda: sweep_page.values(
         {"b": np.array([1.0, 2.0, 3.0, 8.0]), "a": np.array([4.0])}, "regret, %"), [
         (0, "line 0", "regret, %", "", [1.0, 2.0, 3.0, 8.0], [0, 0, 0, 0]),
         (0, "line 1", "regret, %", "", [2.5, 2.5], [-0.3, 0.3]),
@@ -719,10 +719,10 @@ def test_example_loops_stand_in_the_column_of_their_goal_with_the_optimum_from_t
 def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_values_are_on_a_logarithmic_axis() -> None:
     """Of 9, 4 and 5 the worst is 9 and the mean of the middle half is that of all; the second step has one value."""
     each = np.array([[9.0, 4.0, 5.0], [np.nan, 2.0, np.nan]])
-    ax = sweep_charts.learning_curves([("a", np.array(STEPS), each)], "").axes[0]
+    ax = sweep_page.learning_curves([("a", np.array(STEPS), each)], "").axes[0]
     np.testing.assert_allclose([line.get_ydata() for line in ax.lines[:2]], [[6.0, 2.0], [9.0, 2.0]])
     narrow, wide = ({"a": np.array([1.0, 2.0]), "b": np.array([most])} for most in (29.0, 31.0))
-    assert [sweep_charts.values(each, "").axes[0].get_xscale() for each in (narrow, wide)] == ["linear", "log"]
+    assert [sweep_page.values(each, "").axes[0].get_xscale() for each in (narrow, wide)] == ["linear", "log"]
 
 
 @pytest.mark.parametrize(

@@ -282,14 +282,14 @@ def test_a_policy_is_asked_for_with_the_bench_the_setpoints_and_the_stake_of_the
     each = {"M1": {"setpoints": [0.3, 0.7], "minutes": [5.0, 5.0], "temperatures": [37.0, 37.0]}}
     bench = Bench(volume_ml=15.0, max_rate=0.015, period_s=90.0)
     law = LearnedConfig(estimator={"noise_floor": 0.01})
-    own = {"policy": "mine.npz", "poor_regret_pct": 7.0, "force_policy": True, "preflight_only": True}
+    own = {"policy": "mine.npz", "force_policy": True, "preflight_only": True}
     config = replace(TWO, controller=law, bench=bench, scenario=CALM, each=each, **own)
     wanted = assemble.unpack(config, tmp_path).wanted
     assert wanted is not None
     assert (wanted.name, wanted.bench, wanted.estimator) == ("mine.npz", bench, {"noise_floor": 0.01})
     assert (wanted.model.control_min, wanted.model.max_pump_rate, wanted.model.tau) == (1.5, 0.015, 0.25)
     assert tuple(wanted.setpoints) == (0.5, 0.6, 0.3, 0.7)
-    assert (wanted.poor_regret_pct, wanted.at_stake, wanted.forced, wanted.refuses) == (7.0, False, True, False)
+    assert (wanted.at_stake, wanted.forced, wanted.refuses) == (False, True, False)
     device = replace(DEVICE, controller=LearnedConfig(), preflight_only=True)
     wanted = assemble.unpack(device, tmp_path).wanted
     assert wanted is not None

@@ -33,7 +33,7 @@ from tests.experiments.proofs import proven, written
 TRAINED = {"updates": 36_000, "regret_pct": 0.1, "model": {"setpoints": [0.2, 0.6, 1.0]}}
 DOUBTFUL = {
     "untrained": ({"updates": 0}, r"before the first update \(train for more steps than agent.learn_start\)"),
-    "poor": ({"regret_pct": 127_981.0}, r"its regret is 127981 %, more than poor_regret_pct = 10 %"),
+    "poor": ({"regret_pct": 127_981.0}, r"its regret is 127981 %, more than 10 %"),
     "elsewhere": (
         {"model": {"setpoints": [0.55, 0.7]}},
         r"trained for setpoints 0.55 to 0.7, the scenario asks for 0.5, 0.8 \(train with env.setpoints",
@@ -91,11 +91,9 @@ def test_a_policy_that_is_not_safe_is_kept_from_a_culture_with_all_that_it_lacks
 
 
 def test_a_policy_is_sound_at_the_very_ends_of_what_is_allowed(tmp_path, caplog):
-    """Its regret is as large as may be, also by a limit of one's own; asked for are its lowest and highest setpoint."""
+    """Its regret is as large as may be; asked for are its lowest and highest setpoint."""
     edge = {"regret_pct": 10.0, "model": {"setpoints": [0.8, 0.65, 0.5]}, "updates": 1}
     assemble.unpack(deployed(tmp_path, edge, backend=ChiBioConfig()), tmp_path)
-    own = edge | {"regret_pct": 40.0}
-    assemble.unpack(deployed(tmp_path, own, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
@@ -195,7 +193,7 @@ def test_a_look_at_a_policy_says_what_is_wrong_with_it_and_whether_a_run_would_b
     monkeypatch.chdir(tmp_path)
     given = laws.law()
     policy.save(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, "regret_pct": 127.0}))
-    asked = policies.WantedPolicy(name, Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=False, forced=False)
+    asked = policies.WantedPolicy(name, Bench(), EnvConfig(), {}, (0.5,), at_stake=False, forced=False)
     found = policies.policy_check(replace(asked, **changes))
     assert (found.name, found.remedy, found.required) == ("policy", remedy, required)
     assert said in found.detail

@@ -17,7 +17,7 @@ from envs.scenario import Scenario
 from experiments.loop.loop import Step
 from experiments.loop.progress import Progress
 from experiments.record import messages, summary
-from experiments.record.curves import Curves, _results, _table
+from experiments.record.curves import Curves, _results, windows_table
 from experiments.record.record import Record, Recordings
 from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, load_state
 from experiments.reporting import charts
@@ -165,39 +165,6 @@ def test_a_temperature_is_drawn_where_any_of_the_schedules_changes_it() -> None:
     assert len(summary.figure_of(two_reactors(), (SCHEDULES[0], SCHEDULES[0]), "").axes) == 2
 
 
-def under(head: str, table: str, line: int) -> str:
-    """What stands under a heading whose words end where it does."""
-    lines = table.splitlines()
-    end = lines[0].index(head) + len(head)
-    return lines[line][end - 8 : end].strip()
-
-
-def test_every_metric_stands_under_its_own_heading_on_the_console() -> None:
-    window = {"reactor": "M1", "setpoint": 0.65, "ise": 0.1234, "itae": 5.67, "ise_mean": 0.00411, "itae_mean": 0.189}
-    window |= {"settling_min": 12.5, "steady_abs_error": 0.0123, "abs_error": 0.0456}
-    table = summary.metrics_table([window, {**window, "reactor": "M0", "settling_min": math.nan}])
-    heads = {"setpoint": "0.65", "ISE": "0.1234", "ITAE": "5.67", "ISE/T": "0.00411", "ITAE/T": "0.189"}
-    heads |= {"settled": "12.5", "steady": "0.0123", "mean |e|": "0.0456"}
-    assert {head: under(f" {head}", table, 1) for head in heads} == heads
-    assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M0"]
-    assert under("settled", table, 2) == "–"
-
-
-def test_every_error_of_a_share_stands_under_its_own_heading_on_the_console() -> None:
-    """Hours, of windows in minutes; a window without a share is left out, and a setpoint that changes has no number."""
-    asked = {"reactor": "M1", "start_min": 90.0, "end_min": 210.0, "ratio_setpoint": 0.4, "od_abs_error_mean": 0.007}
-    asked |= {"ratio_abs_error_mean": 0.031, "ratio_abs_error_last2h": 0.012, "true_ratio_abs_error_mean": 0.041}
-    none = {**asked, "reactor": "M0", "ratio_abs_error_mean": math.nan}
-    waves = {**asked, "reactor": "M2", "ratio_setpoint": None, "true_ratio_abs_error_mean": math.nan}
-    table = summary.signals_table([none, asked, waves])
-    heads = {"hours": "1.5-3.5", "asked": "0.400", "mean |e|": "0.031", "last 2 h": "0.012", "true |e|": "0.041"}
-    heads |= {"OD |e|": "0.007"}
-    assert {head: under(head, table, 1) for head in heads} == heads
-    assert [line.split()[0] for line in table.splitlines()] == ["share", "M1", "M2"]
-    assert (under("asked", table, 2), under("true |e|", table, 2)) == ("varies", "–")
-    assert summary.signals_table([none]) == ""
-
-
 def step(minute: float, **told: Any) -> Step:
     """Of two reactors, both of which have a sample."""
     zero = np.zeros(2)
@@ -334,7 +301,7 @@ def test_the_results_of_a_run_are_its_worst_error_the_sum_of_its_costs_and_the_m
     assert _results({"windows": windows, "volume_ml": 61.0}) == pytest.approx(
         {"result/steady_abs_error": 0.03, "result/ise": 0.8, "result/share_abs_error": 0.04, "result/medium_ml": 61.0}
     )
-    head, _, *rows = (line.strip("| ").split(" | ") for line in _table(windows).splitlines())
+    head, _, *rows = (line.strip("| ").split(" | ") for line in windows_table(windows).splitlines())
     assert [dict(zip(head, row, strict=True)) for row in rows] == [
         {"reactor": name, "setpoint, OD": goal, "from, min": start, "to, min": end, "steady error, OD": steady,
          "settled after, min": settled, "ISE, OD² min": ise, "error of the share": share}

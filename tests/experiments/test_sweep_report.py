@@ -140,7 +140,7 @@ def test_figures_have_the_best_eight_and_the_values_of_their_own_measure(tmp_pat
     ranked = [sweep_results.Configuration({"agent": f"{k}"}, [], each) for k, each in enumerate(measured)]
     picture = tmp_path / "values.png"
     picture.with_suffix(".svg").write_text("<svg")
-    monkeypatch.setattr(sweep_page.sweep_charts, "values", values := Mock())
+    monkeypatch.setattr(sweep_page, "values", values := Mock())
     monkeypatch.setattr(sweep_page.charts, "save", lambda figure, folder, name: picture)
     out = Page("", "")
     sweep_page._figures(out, tmp_path, ranked, lambda name: f"<{name}>")

@@ -25,7 +25,7 @@ from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
 from experiments.coculture.base import SEEN, SEEN_AHEAD
 from experiments.train import main as entry_point
-from experiments.training import build
+from experiments.training import agents
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
 from experiments.training.density import DensityTask, first_actions
@@ -124,7 +124,7 @@ def test_selection_and_report_share_no_start():
 def test_what_is_remembered_follows_the_model_also_at_the_end_of_an_episode():
     """x' = f(u) x towards the same setpoint in every transition of six episodes, and nothing is final."""
     env = EnvConfig(episode_steps=5)
-    trainer = build.trainer(DensityTask(env), TrainConfig().agent, range(3))
+    trainer = agents.trainer(DensityTask(env), TrainConfig().agent, range(3))
     trainer._observation, _ = trainer.env.reset()
     for _ in range(30):
         trainer._step()

@@ -134,7 +134,7 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
 
 def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
     """Per variant: median, interquartile mean and worst seed of every measure."""
-    from experiments.reporting.tensorboard import interquartile_mean
+    from experiments.reporting.tables import interquartile_mean
 
     out: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(row.ablation for row in rows):

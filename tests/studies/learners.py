@@ -33,9 +33,10 @@ from experiments.coculture.task import Coculture
 from experiments.laws import registry
 from experiments.reporting.tables import number
 from experiments.train import main as train
-from experiments.training import build, tasks
+from experiments.training import tasks
+from experiments.training.agents import act_with
+from experiments.training.density import Preview
 from experiments.training.evaluation import Act, Evaluation
-from experiments.training.preview import Preview
 from experiments.training.session import Session
 from tests.entry import command
 from tests.studies.results import leave
@@ -157,7 +158,7 @@ def ours(job: Job, folder: Path) -> tuple[int, Act]:
     session = Session(config, folder)
     session.run()
     session.writer.close()
-    return config.agent.total_steps, build.act_with(session.agents.network, session.agents.weights())
+    return config.agent.total_steps, act_with(session.agents.network, session.agents.weights())
 
 
 def rival(job: Job) -> tuple[int, Act]:
