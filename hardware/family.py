@@ -172,7 +172,7 @@ class Family:
         """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
 
     def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
-        """Whether spare pumps (numbers, per reactor) can give large doses to `who`, a key. Raises: UnfitError."""
+        """Whether spare pumps, by number for each reactor, can give what `who`, a key, asks for. Raises: UnfitError."""
         if not any(pumps):
             return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML

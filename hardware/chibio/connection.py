@@ -166,7 +166,7 @@ class Connection:
         self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
 
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """Switch these pumps off, verified; the waste pump last, as it runs where a feed pump may.
+        """Switch these pumps off, verified; the waste pump last, which runs on while a feed pump may run.
 
         Each is tried even if another one fails, unless nothing answers. Read-back alone proves nothing, for the flags
         are intent: with the bus hung they say off while the motor runs. So a blocking call touches the bus in between.

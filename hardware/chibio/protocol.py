@@ -125,7 +125,7 @@ class DeviceState:
 
     @property
     def ended(self) -> bool:
-        """Whether the log says last that all ended: "Experiment Stopped", newer "Experiment on M0 (ID) Stopped"."""
+        """Whether the log's newest line is of the end: "Experiment Stopped", newer "Experiment on M0 (ID) Stopped"."""
         return re.search(r"\bExperiment\b.*\bStopped\b", self.terminal) is not None
 
     @property

@@ -173,7 +173,7 @@ class ChibioStation(Station):
             raise messages.DoesNotStart(reactor=self.name)
 
     def _recover(self, kind: str) -> Task:
-        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead; else said."""
+        """Task: switch pumps off and start the experiment again, after a stop if its thread is dead; tell a failure."""
         self._restarts += 1
         if self._restarts > 1:
             self.book.tell(messages.RestartedAgain(attempt=self._restarts))
@@ -301,7 +301,7 @@ class ChibioStation(Station):
             self.book.tell(messages.NotPutRight(item=item, found=found, done=done, error=error))
 
     def dose(self, rate: float, number: int) -> DosePlan:
-        """Begin the dose, mL/s by pump `number`, for the newest sample, unless the reactor may not be dosed now."""
+        """Begin the dose for the newest sample, `rate` mL/s by pump `number`, unless none may be given now."""
         refusal: Message | None = self.book.fault
         pump = f"Pump{number}"
         if self.handed_over:

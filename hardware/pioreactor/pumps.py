@@ -188,6 +188,7 @@ class Pumps:
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
+        """Follow a job to its end; return what it gave."""
         job = request.job
         if why := (yield from self._begins(request)):
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
@@ -216,6 +217,7 @@ class Pumps:
         return (now - on_s) * flow if self.box.heard_s > end_s else 0.0
 
     def broke(self, request: Request) -> bool:
+        """Whether the connection to the broker was lost since a run was asked for."""
         return self.mqtt.broke_s >= request.asked_s
 
     def _begins(self, request: Request) -> Steps[Message | None]:
@@ -345,7 +347,7 @@ class ForcedEnd:
         self._from_s = max(request.asked_s, told_s if told_s < math.inf else -math.inf)
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
-        self._quiet_s = self._still_s = self._left_s = math.inf
+        self._quiet_s = self._still_s = math.inf
         self._apart_s = self.began
         self._short: Future[str] | None = None
         self._rebooted = self.lost = self._held = False
@@ -384,10 +386,7 @@ class ForcedEnd:
         if told and not pin.on and not self._untold:
             self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
-            first, self._listed = self._listed is None, any(row["job_name"] == self._job for row in rows[0])
-            begun = self._request.ml > 0.0 and (pin.on_s >= self._since or p.said(self._request) > 0.0)
-            if begun and first and not self._listed:  # a job leaves the list after its pin is off, a killed one stays
-                self._left_s = p.clock.now()
+            self._listed = any(row["job_name"] == self._job for row in rows[0])
             self._rebooted = not self._listed and p.rebooted(rows[0])
             p.boot = boot_of(rows[0]) if self._rebooted else p.boot
         ended = self._shorts() > self._shorts_before and state.word == "disconnected"
@@ -424,15 +423,14 @@ class ForcedEnd:
         p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
-        flowed = max(min(now, self._left_s) - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
+        flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
         return flowed if not broke and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
         """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pins[self._job], self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
-        off_s = min(off_s, self._still_s, self._left_s)
-        longest = min(max(off_s - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
+        longest = min(max(min(off_s, self._still_s) - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
         if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
             ran = longest

@@ -18,7 +18,7 @@ def problem(error: Exception) -> str:
 
 
 def read_text(path: Path | str) -> str:
-    """Read a YAML file; aliases, which can stand for gigabytes, are refused. Raises: OSError; ValueError."""
+    """Read a YAML file; aliases, which may stand for gigabytes, are refused. Raises: OSError; ValueError, one line."""
     with open(path, "rb") as f:
         data = f.read(LARGEST + 1)
     if len(data) > LARGEST:

@@ -303,29 +303,6 @@ def test_a_pump_that_runs_on_is_booked_as_it_flows_and_spills_no_more_than_a_dos
     assert float(ledger.volume_ml[0]) == pytest.approx(volume_ml, abs=SLACK_ML)
 
 
-@pytest.mark.parametrize("killed", [False, True])
-def test_what_a_job_gave_of_which_nothing_was_heard_ends_as_it_leaves_the_list_and_a_killed_one_stays(
-    monkeypatch, killed
-):
-    """For a minute no message of the unit comes through, its requests do; then all come late."""
-    lab = sampled(monkeypatch)
-    lab.world.kill_after_s = 1.0 if killed else np.inf
-    lab.dose(1.4)
-    lab.until(lambda: MEDIA_PIN in lab.world.since, 5.0)
-    lab.wait(0.6)
-    say, kept = lab.world.say, list[tuple[tuple[str, ...], dict[str, bool]]]()
-    lab.world.say = lambda *said, **how: kept.append((said, how))
-    lab.wait(60.0)
-    lab.world.say = say
-    for said, how in kept:
-        lab.world.say(*said, **how)
-    lab.world.kill_after_s = np.inf
-    unlock(lab)
-    lab.well()
-    lab.check_given(SLACK_ML)
-    assert killed or lab.given()[1] < 1.4 + 8.0 * FLOW["add_media"]
-
-
 def test_a_media_pump_that_stands_on_past_its_dose_is_drained_at_once(monkeypatch):
     """Its process is frozen: the vial rises by the dose and by what flows until the waste pump has begun."""
     lab = sampled(monkeypatch)
