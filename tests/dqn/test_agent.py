@@ -1,15 +1,18 @@
-"""The agent as a whole: an easy problem, populations, resuming, and one update recomputed with torch's own parts."""
+"""Agents and their training: minibatches, updates, exploration, populations, copies, records."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from dqn.agent import DQNAgent
 from dqn.config import DQNConfig
+from dqn.population import Population
 from dqn.replay import Transition
-from dqn.trainer import Trainer
+from dqn.trainer import Trainer, TrainRecord
 from tests.dqn.problems import IdentityEnv, streams
 
 pytestmark = pytest.mark.numeric
@@ -201,3 +204,142 @@ def test_relabelling_without_a_goal_is_refused() -> None:
     config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
     with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):
         DQNAgent(config, 3, 3, streams(range(1)))
+
+
+GROUPS = (range(4), range(4, 7), range(7, 8))
+
+
+def _population(threads: int) -> Population:
+    trainers = [Trainer(IdentityEnv(s), DQNAgent(SMALL, 3, 3, streams(s)), interval=50) for s in GROUPS]
+    return Population(trainers, threads)
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    one, many = _population(1), _population(3)
+    for a, b in zip(one.run(), many.run(), strict=True):
+        assert a.step == b.step
+        assert a.episode_return.shape == a.curves["train/loss"].shape == (8,)
+        np.testing.assert_array_equal(a.episode_return, b.episode_return)
+        for tag, values in a.curves.items():
+            np.testing.assert_array_equal(values, b.curves[tag])
+    assert (many.n_agents, many.steps, many.updates) == (8, SMALL.total_steps, SMALL.total_updates)
+    assert torch.equal(one.weights(), many.weights())
+
+
+def test_agents_come_in_the_order_of_their_groups() -> None:
+    """Agent 5 of the population is the second of the second group, and is the seed 5 trained alone."""
+    population = _population(2)
+    list(population.run())
+    weights = population.weights()
+    assert torch.equal(weights[5], population.groups[1].agent.network.flat[1])
+    alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
+    first = next(alone.run())
+    np.testing.assert_allclose(next(_population(2).run()).episode_return[5], first.episode_return[0])
+
+
+def test_an_error_in_one_group_ends_the_run() -> None:
+    class Broken(Trainer):
+        def run(self) -> Iterator[TrainRecord]:
+            yield from ()
+            raise RuntimeError("vial 3 is missing")
+
+    population = _population(2)
+    broken = population.groups[1]
+    population.groups[1] = Broken(broken.env, broken.agent, 50)
+    with pytest.raises(RuntimeError, match="vial 3 is missing"):
+        list(population.run())
+
+
+def test_no_running_mean_stays_too_small_for_the_processor() -> None:
+    """Units that are never on have gradient 0, and 0.9^k of an earlier one falls below 1e-38 within 900 updates."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "hidden": (8,), "learning_rate": 0.05})
+    agent = DQNAgent(config, 3, 3, streams(range(4)))
+    agent.network.flat[:, 24:28] = -10.0  # biases of the first four units
+    earlier = agent.state_dict()
+    earlier["adam"]["mean"].fill_(1e-3)
+    agent.load_state_dict(earlier)
+    population = Population([Trainer(IdentityEnv(range(4)), agent, interval=100)])
+    list(population.run())
+    mean = population.state_dict()["groups"][0]["agent"]["adam"]["mean"][:, 24:28]
+    assert not ((mean != 0) & (mean.abs() < torch.finfo(torch.float32).tiny)).any()
+
+
+Array = NDArray[Any]
+
+
+class Uneven:
+    """Copy 0 ends by itself after every second step, copy 1 is cut off after every third; each pays its number + 1.
+
+    What is shown is 10 copy + the step of the episode, from 0 on.
+    """
+
+    def __init__(self) -> None:
+        self._step = np.zeros(2, dtype=np.int64)
+
+    def _show(self) -> Array:
+        return (10.0 * np.arange(2) + self._step)[:, None].astype(np.float32)
+
+    def reset(self) -> tuple[Array, dict[str, Any]]:
+        return self._show(), {}
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        self._step = self._step + 1
+        last, done = self._show(), self._step == [2, 3]
+        self._step = np.where(done, 0, self._step)
+        terminated = done & [True, False]
+        return (
+            self._show(),
+            np.array([1.0, 2.0]),
+            terminated,
+            done & ~terminated,
+            {"final_obs": np.where(done[:, None], last, -1.0)},
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"step": self._step.tolist()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> Array:
+        self._step = np.array(state["step"])
+        return self._show()
+
+
+def test_torch_keeps_no_graph_while_it_trains_and_goes_on_when_it_is_used_afterwards() -> None:
+    class Asked(Uneven):
+        kept: bool = False
+
+        def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+            self.kept |= not torch.is_inference_mode_enabled()
+            return super().step(actions)
+
+    config = DQNConfig(hidden=(8,), total_steps=40, learn_start=10, batch_size=4, target_period=7, replay_size=50)
+    env = Asked()
+    trainer = Trainer(env, DQNAgent(config, 1, 2, streams(range(2))), interval=15)
+    assert [record.step for record in trainer.run()] == [15, 30, 40]
+    assert not env.kept
+    before = trainer.agent.network.flat.clone()
+    trainer.agent.learn()
+    assert not torch.equal(before, trainer.agent.network.flat)
+    trainer.agent.load_state_dict(trainer.agent.state_dict())
+
+
+def uneven(total_steps: int = 8) -> Trainer:
+    config = DQNConfig(hidden=(4,), total_steps=total_steps, learn_start=total_steps, replay_size=8)
+    return Trainer(Uneven(), DQNAgent(config, 1, 2, streams(range(2))), interval=4)
+
+
+def test_copies_whose_episodes_end_at_other_steps_and_in_other_ways_are_told_apart() -> None:
+    trainer = uneven()
+    records = list(trainer.run())
+    before, after, _, _, goes_on = trainer.agent.replay.state_dict()["rows"].permute(2, 0, 1).tolist()
+    assert before == [[0, 1] * 4, [10, 11, 12, 10, 11, 12, 10, 11]]
+    assert after == [[1, 2] * 4, [11, 12, 13, 11, 12, 13, 11, 12]]  # the last of an episode, not the next one's first
+    assert goes_on == [[1, 0] * 4, [1] * 8]  # nothing follows an end, and a cut is none
+    assert [record.episode_return.tolist() for record in records] == [[2.0, 6.0], [2.0, 6.0]]
+
+
+def test_records_come_at_multiples_of_their_interval_wherever_a_run_goes_on() -> None:
+    """After six steps the next one is due at eight, and the last at the end."""
+    trainer = uneven(total_steps=11)
+    trainer._observation, _ = trainer.env.reset()
+    trainer._until(6)
+    assert [record.step for record in trainer.run()] == [8, 11]
