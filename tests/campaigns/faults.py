@@ -122,8 +122,7 @@ def all_cases(config: FaultsConfig) -> list[Case]:
 def run_all(config: FaultsConfig, folder: Path) -> list[Outcome]:
     """Every case, in order; a bar on a terminal, in a log the first, every 50th and each at the Pioreactor rig.
 
-    Stopped, it leaves those that are done in cases.csv. Each worker is a fresh process, because a limit on file size,
-    which one fault sets, is the process's.
+    Each worker is a fresh process, because a limit on file size, which one fault sets, is the process's.
     """
     cases = all_cases(config)
     with (
@@ -132,18 +131,13 @@ def run_all(config: FaultsConfig, folder: Path) -> list[Outcome]:
         tqdm(total=len(cases), disable=None, unit="case") as bar,
     ):
         futures = [workers.submit(case.run, config, folder) for case in cases]
-        try:
-            for done, future in enumerate(as_completed(futures), 1):
-                o = future.result()
-                bar.update()
-                if bar.disable and (done == 1 or done % 50 == 0):
-                    log.info("%d of %d cases", done, len(cases))
-                if o.family == "pioreactor":
-                    log.info("%s, %s: %s", o.label, o.moment, ", ".join(o.wrong) or "ok")
-        except KeyboardInterrupt:
-            if ended := [f.result() for f in futures if f.done() and f.exception() is None]:
-                write_cases(folder / "cases.csv", ended)
-            raise
+        for done, future in enumerate(as_completed(futures), 1):
+            o = future.result()
+            bar.update()
+            if bar.disable and (done == 1 or done % 50 == 0):
+                log.info("%d of %d cases", done, len(cases))
+            if o.family == "pioreactor":
+                log.info("%s, %s: %s", o.label, o.moment, ", ".join(o.wrong) or "ok")
         return [future.result() for future in futures]
 
 

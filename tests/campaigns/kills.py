@@ -47,8 +47,6 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
         except BaseException:  # clients and emulators have sessions of their own: nobody else ends them
             stop.set()
             executor.shutdown(cancel_futures=True)
-            ended = [f.result() for f in futures if not f.cancelled() and f.exception() is None]
-            files.write_json(folder / "ended_runs.json", {"runs": [asdict(f) for f in ended]})
             raise
     keys = [k for k, v in asdict(found[0]).items() if isinstance(v, (int, float)) and not isinstance(v, bool)]
     total: dict[str, Any] = {k: sum(getattr(f, k) for f in found) for k in keys}

@@ -52,10 +52,7 @@ class Run:
         self.truth.append({"wall": start + 2.0, "unit": UNIT, "pump": pump, "start": start, "s": ml, "ml": ml})
 
     def judged(self) -> UnitTruth:
-        spans = rig_truth.phases(self.journal, UNIT)
-        held = tuple(rig_truth.held(span, self.truth, UNIT, SPEED) for span in spans)
-        account = rig_truth.account(self.journal, self.truth, UNIT)
-        return UnitTruth(UNIT, held, rig_truth.vial(self.truth, UNIT), account)
+        return rig_truth.found_in(self.journal, self.truth, UNIT, SPEED)
 
     def trouble(self) -> list[str]:
         return rig_truth.trouble(self.judged(), LIMITS, 20.0)
@@ -80,12 +77,12 @@ SOUND = Run()
 
 def test_a_setpoint_is_judged_by_the_true_od_of_the_last_ten_minutes_of_its_window(run: Run) -> None:
     first, second = run.judged().held
-    assert (first.setpoint, second.setpoint) == (0.8, 0.5)  # the first ends with the first decision of the second
-    assert (first.last_error_od, second.last_error_od) == pytest.approx((0.02, 0.004))
+    assert first == pytest.approx((0.8, 0.02))  # it ends with the first decision of the second
+    assert second == pytest.approx((0.5, 0.004))
     for row in run.truth:
         if "od" in row and row["wall"] >= 1150:
             row["od"] = 0.5 + (0.008 if row["wall"] % 2 else -0.008)
-    assert run.judged().held[-1].last_error_od == pytest.approx(0.008)  # to both sides
+    assert run.judged().held[-1][1] == pytest.approx(0.008)  # to both sides
 
 
 def test_every_dose_of_a_sound_run_is_matched_and_only_its_first_window_is_not_held(run: Run) -> None:
@@ -197,21 +194,21 @@ def test_an_offset_of_the_true_od_and_a_window_that_no_truth_covers_are_not_held
     for row in run.truth:
         if "od" in row:
             row["od"] += 0.0061
-    assert run.judged().held[1].last_error_od == pytest.approx(0.0101)
+    assert run.judged().held[1][1] == pytest.approx(0.0101)
     assert len(run.trouble()) == 2
     run.truth = [row for row in run.truth if not ("od" in row and row["wall"] >= 1110)]
-    assert math.isnan(run.judged().held[1].last_error_od)
+    assert math.isnan(run.judged().held[1][1])
     assert len(run.trouble()) == 2
 
 
 def test_a_vial_that_fills_and_a_pump_that_is_on(run: Run) -> None:
     run.truth.append({**run.vial(1301), "peak_ml": 22.1, "duty": {"13": 100.0}})
-    assert (run.judged().vial.peak_ml, run.judged().vial.pumps_off) == (22.1, False)
+    assert (run.judged().peak_ml, run.judged().pumps_off) == (22.1, False)
     assert len(run.trouble()) == 3
 
 
 def test_a_unit_of_which_nothing_is_on_record_keeps_nothing(run: Run) -> None:
-    account = rig_truth.account(run.journal, run.truth, "pio02")
-    found = UnitTruth("pio02", (), rig_truth.vial(run.truth, "pio02"), account)
-    assert math.isnan(found.vial.peak_ml)
+    found = rig_truth.found_in(run.journal, run.truth, "pio02", SPEED)
+    assert found.held == ()
+    assert math.isnan(found.peak_ml)
     assert len(rig_truth.trouble(found, LIMITS, 20.0)) == 4  # no window, no dose, no volume, no pump known to be off

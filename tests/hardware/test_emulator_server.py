@@ -94,25 +94,51 @@ def test_the_state_has_every_field_of_a_recorded_answer_with_its_type_and_sorted
     assert len(mine["OD"]["record"]) == len(mine["time"]["record"]) == 10
 
 
-def test_targets_are_clamped_nan_passes_and_comes_out_as_a_bare_token() -> None:
+def test_a_target_that_is_no_number_passes_and_comes_out_as_a_bare_token() -> None:
     lab = Lab()
-    for value, kept in (("5", 1.0), ("-5", -1.0), ("-0.2", -0.2), ("inf", 1.0), ("-inf", -1.0)):
-        assert lab.post(f"/SetOutputTarget/Pump1/M0/{value}") == 204
-        assert lab.state()["Pump1"]["target"] == kept
-    lab.post("/SetOutputTarget/Thermostat/M0/80")
-    assert lab.state()["Thermostat"]["target"] == 50.0
     assert lab.post("/SetOutputTarget/Pump3/M0/nan") == 204
     body = lab.device.handle("GET", "/getSysdata/")[1]
     assert b":NaN" in body
     assert math.isnan(json.loads(body)["Pump3"]["target"])
 
 
-def test_force_is_on_off_and_anything_else_toggles() -> None:
+BOTH_ON = [(f"SetOutput{it}", {}) for p in "12" for it in (f"Target/Pump{p}/M0/0.1", f"On/Pump{p}/1/M0")]
+FORCED = ((1, 1), (1, 1), (0, 0), (0, 0), (2, 1), (7, 0), (-1, 1))
+CLAMPED = {"5": 1.0, "-5": -1.0, "-0.2": -0.2, "inf": 1.0, "-inf": -1.0}
+SHOWN: dict[str, list[tuple[str, dict[str, float]]]] = {  # requests one after another, and what the device shows then
+    "targets are clamped": [(f"SetOutputTarget/Pump1/M0/{v}", {"Pump1.target": kept}) for v, kept in CLAMPED.items()],
+    "so is a temperature": [("SetOutputTarget/Thermostat/M0/80", {"Thermostat.target": 50.0})],
+    "1 is on, 0 is off, and anything else toggles": [
+        ("SetOutputTarget/Pump1/M0/0.1", {}),
+        *((f"SetOutputOn/Pump1/{force}/M0", {"Pump1.ON": on}) for force, on in FORCED),
+    ],
+    "target 0 refuses to go on, and stays off when a target comes": [
+        ("SetOutputOn/Pump1/1/M0", {"Pump1.ON": 0}), ("SetOutputTarget/Pump1/M0/0.1", {}),
+        ("SetOutputOn/Pump1/1/M0", {"Pump1.ON": 1}), ("SetOutputTarget/Pump1/M0/0", {"Pump1.ON": 0}),
+        ("SetOutputTarget/Pump1/M0/0.1", {"Pump1.ON": 0}),
+    ],
+    "switching regulation either way turns both pumps off": [
+        *BOTH_ON, ("SetOutputOn/OD/1/M0", {"OD.ON": 1, "Pump1.ON": 0, "Pump2.ON": 0}),
+        *BOTH_ON, ("SetOutputOn/OD/0/M0", {"OD.ON": 0, "Pump1.ON": 0, "Pump2.ON": 0}),
+    ],
+    "direction negates the target, and under regulation the direction, too": [
+        ("SetOutputTarget/Pump1/M0/0.1", {}), ("Direction/Pump1/M0", {"Pump1.target": -0.1, "Pump1.direction": 1.0}),
+        ("SetOutputOn/OD/1/M0", {}), ("Direction/Pump1/M0", {"Pump1.target": 0.1, "Pump1.direction": -1.0}),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_what_the_device_shows_after_each_request(name: str) -> None:
+    """And no motor turns in the end that is not shown as on."""
     lab = Lab()
-    lab.post("/SetOutputTarget/Pump1/M0/0.1")
-    for force, on in (("1", 1), ("1", 1), ("0", 0), ("0", 0), ("2", 1), ("7", 0), ("-1", 1)):
-        lab.post(f"/SetOutputOn/Pump1/{force}/M0")
-        assert lab.state()["Pump1"]["ON"] == on
+    for path, shown in SHOWN[name]:
+        assert lab.post(f"/{path}") == 204
+        state = lab.state()
+        assert {key: state[key.partition(".")[0]][key.partition(".")[2]] for key in shown} == shown
+    lab.wait(100.0)
+    motors = lab.device.truth("M0")["motors"]
+    assert all(lab.state()[pump]["ON"] for pump, turns in motors.items() if turns)
 
 
 @pytest.mark.parametrize(
@@ -166,27 +192,6 @@ def test_blocking_times(path: str, seconds: float) -> None:
     if stirs:
         assert [taken("/SetOutputOn/Stir/1/M0"), taken(path)] == pytest.approx([seconds] * 2, abs=0.02)
         assert lab.device.vials["M0"].stir == float(path.rpartition("/")[2])
-
-
-def test_switching_regulation_either_way_turns_both_pumps_off() -> None:
-    lab = Lab()
-    for force in ("1", "0"):
-        for pump in ("Pump1", "Pump2"):
-            lab.post(f"/SetOutputTarget/{pump}/M0/0.1")
-            lab.post(f"/SetOutputOn/{pump}/1/M0")
-        lab.post(f"/SetOutputOn/OD/{force}/M0")
-        state = lab.state()
-        assert (state["OD"]["ON"], state["Pump1"]["ON"], state["Pump2"]["ON"]) == (int(force), 0, 0)
-
-
-def test_direction_negates_the_target_and_under_regulation_the_direction_too() -> None:
-    lab = Lab()
-    lab.post("/SetOutputTarget/Pump1/M0/0.1")
-    lab.post("/Direction/Pump1/M0")
-    assert (lab.state()["Pump1"]["target"], lab.state()["Pump1"]["direction"]) == (-0.1, 1.0)
-    lab.post("/SetOutputOn/OD/1/M0")
-    lab.post("/Direction/Pump1/M0")
-    assert (lab.state()["Pump1"]["target"], lab.state()["Pump1"]["direction"]) == (0.1, -1.0)
 
 
 def test_reset_wipes_the_selected_reactor_only() -> None:

@@ -278,21 +278,6 @@ def test_full_duty_is_continuous_and_no_number_moves_nothing(target: float) -> N
     assert [length for _, length in lab.doses(pump="Pump3")] == pytest.approx(lengths, abs=0.03)
 
 
-def test_target_0_refuses_to_go_on_and_stays_off_when_a_target_comes() -> None:
-    lab = Lab()
-    lab.post("/SetOutputOn/Pump1/1/M0")
-    assert lab.state()["Pump1"]["ON"] == 0
-    lab.pump("Pump1", 0.1)
-    assert lab.state()["Pump1"]["ON"] == 1
-    lab.wait(10.0)
-    lab.post("/SetOutputTarget/Pump1/M0/0")
-    assert lab.state()["Pump1"]["ON"] == 0
-    lab.post("/SetOutputTarget/Pump1/M0/0.1")
-    assert lab.state()["Pump1"]["ON"] == 0
-    lab.wait(100.0)
-    assert len(lab.doses()) == 1
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_negative_target_runs_backwards_and_draws_culture_out(turned: bool) -> None:
     """Also where it is turned before the thread reads it."""
