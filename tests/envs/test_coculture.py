@@ -2,10 +2,8 @@
 
 import itertools
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, limits, logit, passed, share
@@ -44,23 +42,6 @@ def test_the_reward_is_that_of_the_setpoint_in_force() -> None:
     for wanted in ([0.4, 0.4], [0.8, 0.4], [0.8, 0.8]):
         _, reward, *_ = env.step(np.array([10, 10]))
         np.testing.assert_allclose(reward, -np.square(share(env.state[:, 0]) - wanted), rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["Coculture-v0", "CoculturePreview-v0"])
-def test_gymnasium_knows_it(name: str) -> None:
-    check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
-    many = gymnasium.make_vec(name, num_envs=3)
-    observation, _ = many.reset(seed=4)
-    assert observation in many.observation_space
-    saved = many.unwrapped.state_dict()  # type: ignore[attr-defined]
-    other = gymnasium.make_vec(name, num_envs=3).unwrapped
-    other.reset(seed=9)
-    np.testing.assert_array_equal(other.load_state_dict(saved), observation)  # type: ignore[attr-defined]
-    for action in (0, 16, 5):
-        one, two = many.step(np.full(3, action)), other.step(np.full(3, action))
-        np.testing.assert_array_equal(one[0], two[0])
-    episode = 72 if name == "Coculture-v0" else 24
-    assert gymnasium.make(name).spec.max_episode_steps == episode  # type: ignore[union-attr]
 
 
 def minutes_of_two(state: np.ndarray, target: np.ndarray, minutes: float, step: float = 0.1) -> np.ndarray:

@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 from envs.optimum import solve_relative
 from envs.relative import RelativeConfig, RelativeVectorEnv, nearest_level
@@ -33,6 +31,7 @@ def test_a_step_is_a_period_of_the_growth_model(overrides: dict[str, float]) -> 
         env.state[:] = np.stack([error, np.full(od.size, share)], axis=1)
         _, reward, *_ = env.step(np.full(od.size, action))
         reached = od * step_factors(model)[action]
+        np.testing.assert_array_equal(env.state[:, 1], share)
         np.testing.assert_allclose(setpoint * np.exp(full_pump * env.state[:, 0]), reached, rtol=1e-6)
         np.testing.assert_allclose(reward, -((np.log(reached / setpoint) / full_pump) ** 2), rtol=1e-5, atol=1e-9)
 
@@ -47,26 +46,6 @@ def test_starts_cover_the_range_and_depend_on_the_seed_of_their_copy_alone() -> 
     thirds = [np.histogram2d(*start.T, 3)[0] / len(start)]  # every error with every share, none is left untrained
     np.testing.assert_allclose(thirds, 1.0 / 9.0, atol=0.025)
     np.testing.assert_array_equal(one.reset(seed=3 + 41)[0][0], start[41])
-
-
-def test_episodes_end_and_begin_again_as_gymnasium_asks() -> None:
-    env = RelativeVectorEnv(3, episode_steps=4)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    env.reset(seed=1)
-    before = env.state[:, 1].copy()
-    for k in range(4):
-        observation, _, terminated, truncated, infos = env.step(np.full(3, 8))
-        assert not terminated.any()
-        assert truncated.all() == (k == 3)
-    np.testing.assert_allclose(infos["final_obs"][:, 1], before, rtol=1e-6)
-    assert (observation[:, 1] != infos["final_obs"][:, 1]).all()
-    saved = env.state_dict()
-    other = RelativeVectorEnv(3, episode_steps=4)
-    other.reset(seed=9)
-    np.testing.assert_array_equal(other.load_state_dict(saved), observation)
-    for _ in range(9):
-        np.testing.assert_array_equal(env.step(np.full(3, 5))[0], other.step(np.full(3, 5))[0])
-    assert gymnasium.make_vec("Bioreactor-v0", num_envs=1)  # the paper's task is registered beside it
 
 
 def test_the_nearest_level_by_hand() -> None:
