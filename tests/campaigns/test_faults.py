@@ -23,10 +23,8 @@ from tests.campaigns.audit import Served, audit_doses, audit_rows, rows_per_samp
 from tests.campaigns.chibio_case import ChiBioCase
 from tests.campaigns.chibio_faults import Act, both, post, run_device, set_
 from tests.campaigns.fault import FAMILIES, REAL, VIRTUAL, Fault
-from tests.campaigns.fault_table import FAULTS, by_name
-from tests.campaigns.faults import FaultsConfig, all_cases, faults
-from tests.campaigns.killed_run import KillConfig, errors_in_lives, longest_out_min
-from tests.campaigns.kills import kill_campaign
+from tests.campaigns.faults import FAULTS, FaultsConfig, all_cases, by_name, faults
+from tests.campaigns.kills import KillConfig, errors_in_lives, kill_campaign, longest_out_min
 from tests.campaigns.outcome import Outcome, allowed, declared, judged, table, totals
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.campaigns.soak import SoakConfig, soak

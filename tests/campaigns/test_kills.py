@@ -12,7 +12,7 @@ import pytest
 from experiments.recordings.reader import read_recording
 from hardware.emulator.process import EmulatorProcess
 from hardware.storage.journal import read_journal
-from tests.campaigns.killed_run import Clients, Comparison, Findings, KillConfig
+from tests.campaigns.kills import Clients, Comparison, Findings, KillConfig
 from tests.campaigns.soak import Day, SoakConfig, soak, soak_run
 from tests.patience import PATIENCE_S
 
