@@ -127,13 +127,9 @@ def test_gymnasiums_own_time_limit_shortens_episodes():
 
 @pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_a_way_to_draw_that_does_not_exist_is_refused(make):
+def test_a_way_to_draw_is_refused_and_who_asks_for_a_picture_told_that_there_is_none(make):
     with pytest.raises(TypeError, match="render_mode = human: allowed None"):
         make(ID, render_mode="human")
-
-
-@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_who_asks_for_a_picture_is_told_that_there_is_none(make):
     env = make(ID)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="this environment has nothing to draw"):

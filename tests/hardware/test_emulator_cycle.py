@@ -152,24 +152,12 @@ def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
     assert isinstance(lab.peek()["Experiment"]["startTimeRaw"], str)
 
 
-def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
+@pytest.mark.parametrize("path", ["/Experiment/0/M0", "/Experiment/1/M0"])  # a second start stops
+def test_a_stop_switches_pumps_1_and_2_off_at_once_and_the_end_of_its_cycle_all_else(path: str) -> None:
+    """Pumps 3 and 4, and what was started meanwhile."""
     lab = running(wait=20.0)
     for pump in (1, 2, 3, 4):
         lab.pump(f"Pump{pump}", 0.3)
-    lab.post("/Experiment/0/M0")
-    state = lab.state()
-    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 1, 1]
-    assert state["OD"]["ON"] == 0
-    assert "Stopped" not in state["Terminal"]["text"]
-    lab.wait_until(61.0)  # the thread slept out its cycle
-    state = lab.state()
-    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
-    assert "Experiment Stopped" in state["Terminal"]["text"].split("</br>")[0]
-
-
-@pytest.mark.parametrize("path", ["/Experiment/0/M0", "/Experiment/1/M0"])  # a second start stops
-def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile(path: str) -> None:
-    lab = running(wait=20.0)
     lab.post(path)
     seen = [lab.state()]
     lab.post("/SetOutputOn/Stir/1/M0")
@@ -177,8 +165,12 @@ def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile(path
     for at in (58.0, 62.0):
         lab.wait_until(at)
         seen.append(lab.state())
-    items = ("Experiment", "Thermostat", "Stir")
-    assert [[state[item]["ON"] for item in items] for state in seen] == [[0, 0, 0], [0, 1, 1], [0, 0, 0]]
+    items = ("Pump1", "Pump2", "Pump3", "Pump4", "OD", "Experiment", "Thermostat", "Stir")
+    assert [[state[item]["ON"] for item in items] for state in seen] == [
+        [0, 0, 1, 1, 0, 0, 0, 0], [0, 0, 1, 1, 0, 0, 1, 1], [0] * 8,
+    ]  # fmt: skip
+    said = [state["Terminal"]["text"].partition("</br>")[0] for state in seen]
+    assert ["Stopped" in text for text in said] == [False, False, True]
 
 
 def test_stop_in_the_first_five_seconds_takes_the_cycle_back() -> None:

@@ -362,16 +362,11 @@ def test_after_a_quarter_of_an_hour_it_is_lost_until_it_comes_back() -> None:
     assert bench.step(0.0)[1].kinds == (("fluorescence",),)
 
 
-def test_one_that_never_came_is_lost_too() -> None:
-    bench = Bench(light_lost=3.0)
-    kinds = [bench.step(NAN)[1].kinds[0] for _ in range(5)]
-    assert kinds == [("fluorescence",)] * 4 + [("fluorescence_lost",)]
-
-
-def test_it_may_be_declared_to_hold() -> None:
-    bench = Bench(light_lost=1.0, responses=Responses(fluorescence_lost="hold"))
-    bench.step(1500.0)
-    assert [bench.step(0.0)[1].response[0] for _ in range(2)] == [Response.PASS, Response.HOLD]
+def test_one_that_never_came_is_lost_too_and_may_be_declared_to_hold() -> None:
+    bench = Bench(light_lost=3.0, responses=Responses(fluorescence_lost="hold"))
+    verdicts = [bench.step(NAN)[1] for _ in range(5)]
+    assert [v.kinds[0] for v in verdicts] == [("fluorescence",)] * 4 + [("fluorescence_lost",)]
+    assert [v.response[0] for v in verdicts] == [Response.PASS] * 4 + [Response.HOLD]
 
 
 def test_a_resumed_run_remembers_repeats_and_silence() -> None:
