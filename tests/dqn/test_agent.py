@@ -1,6 +1,7 @@
 """Agents and their training: minibatches, updates, exploration, populations, copies, records."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ def test_a_minibatch_is_of_the_rows_that_each_agent_s_own_numbers_choose() -> No
 @pytest.mark.parametrize("together", [4, 5, 200])
 def test_updates_of_one_step_are_those_that_are_made_one_by_one(changes: dict[str, Any], together: int) -> None:
     """200 updates, more than a block of random numbers holds, with copies after every 23: in groups and one by one."""
-    config = DQNConfig(**{**SMALL.__dict__, "target_period": 23, **changes})
+    config = replace(SMALL, target_period=23, **changes)
     one, many = _filled(config, range(3)), _filled(config, range(3))
     for _ in range(200):
         one.learn()
@@ -96,7 +97,7 @@ def test_updates_of_one_step_are_those_that_are_made_one_by_one(changes: dict[st
 
 def test_the_target_network_is_asked_once_for_all_updates_between_two_copies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Period 6, eight updates a step: of the second step four come before the copy after update 12, and four after."""
-    agent = _filled(DQNConfig(**{**SMALL.__dict__, "target_period": 6}), range(3))
+    agent = _filled(replace(SMALL, target_period=6), range(3))
     forward, asked = agent.target.forward, []
 
     def counted(features: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -111,7 +112,7 @@ def test_the_target_network_is_asked_once_for_all_updates_between_two_copies(mon
 
 def test_the_target_network_is_copied_when_it_is_due_and_stays_in_between() -> None:
     """Period 4: the target network is that of updates 0, 4, 8, 12 until the next of them."""
-    agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "target_period": 4}), 3, 3, streams(range(2)))
+    agent = DQNAgent(replace(SMALL, target_period=4), 3, 3, streams(range(2)))
     draws = torch.Generator().manual_seed(0)
     history = [agent.network.flat.clone()]
     for update in range(1, 14):
@@ -124,9 +125,7 @@ def test_the_target_network_is_copied_when_it_is_due_and_stays_in_between() -> N
 
 def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() -> None:
     """At gamma 0: Q = 10 * 1 where the environment paid 1, 10 * -2 where half of a minibatch got a goal paying -2."""
-    config = DQNConfig(
-        **{**SMALL.__dict__, "gamma": 0.0, "reward_scale": 10.0, "hindsight_share": 0.5, "learning_rate": 1e-2}
-    )
+    config = replace(SMALL, gamma=0.0, reward_scale=10.0, hindsight_share=0.5, learning_rate=1e-2)
 
     class Elsewhere(Shifted):
         def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
@@ -144,7 +143,7 @@ def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() ->
 
 def test_exploration_follows_epsilon_and_tries_every_action_equally_often() -> None:
     """At epsilon 0.6 with 5 actions the greedy one comes up in 0.4 + 0.6 / 5 of the steps, each other one in 0.12."""
-    config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.6, "epsilon_end": 0.6})
+    config = replace(SMALL, epsilon_start=0.6, epsilon_end=0.6)
     agent = DQNAgent(config, 3, 5, streams(range(64)))
     observation = torch.eye(3)[torch.arange(64) % 3]
     greedy = agent.network(observation.unsqueeze(1))[:, 0].argmax(-1).numpy()
@@ -163,7 +162,7 @@ def test_epsilon_falls_linearly(steps: int, step: int, expected: float) -> None:
 
 def test_as_large_a_share_of_a_minibatch_gets_another_goal_as_is_asked_for() -> None:
     """A quarter of 16: four of each agent, whatever is drawn."""
-    config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.25})
+    config = replace(SMALL, hindsight_share=0.25)
 
     class Marked(Shifted):
         def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
@@ -177,7 +176,7 @@ def test_as_large_a_share_of_a_minibatch_gets_another_goal_as_is_asked_for() -> 
 
 def test_the_last_updates_are_taken_at_the_rate_that_the_config_ends_with() -> None:
     """Adam's first step is as long as its rate, whatever the gradient."""
-    config = DQNConfig(**{**SMALL.__dict__, "learning_rate_end": 3e-5})
+    config = replace(SMALL, learning_rate_end=3e-5)
     for update, rate in ((0, 3e-3), (config.total_updates, 3e-5)):
         agent = DQNAgent(config, 3, 3, streams(range(2)))
         agent.updates, before = update, agent.network.flat.clone()
@@ -189,7 +188,7 @@ def test_costs_are_learned_in_the_scale_of_their_root_and_gaps_are_widened_there
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """h(z) = c - sqrt(c^2 - z), h^-1(q) = c^2 - (c - q)^2: y = h(r + g h^-1(max q')) - gap (max q - q_a), c = 0.4."""
-    config = DQNConfig(**{**SMALL.__dict__, "value_root": 0.4, "action_gap": 0.25, "gamma": 0.9})
+    config = replace(SMALL, value_root=0.4, action_gap=0.25, gamma=0.9)
     agent = DQNAgent(config, 1, 3, streams(range(1)))
     after, now = torch.tensor([-0.5, -0.3, -0.7]), torch.tensor([-0.9, -0.1, -0.6])
     monkeypatch.setattr(agent, "_q_target", lambda seen: torch.where(seen[..., :1] > 0.0, after, now))
@@ -201,7 +200,7 @@ def test_costs_are_learned_in_the_scale_of_their_root_and_gaps_are_widened_there
 
 
 def test_relabelling_without_a_goal_is_refused() -> None:
-    config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
+    config = replace(SMALL, hindsight_share=0.5)
     with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):
         DQNAgent(config, 3, 3, streams(range(1)))
 
@@ -252,7 +251,7 @@ def test_an_error_in_one_group_ends_the_run() -> None:
 
 def test_no_running_mean_stays_too_small_for_the_processor() -> None:
     """Units that are never on have gradient 0, and 0.9^k of an earlier one falls below 1e-38 within 900 updates."""
-    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "hidden": (8,), "learning_rate": 0.05})
+    config = replace(SMALL, total_steps=1200, hidden=(8,), learning_rate=0.05)
     agent = DQNAgent(config, 3, 3, streams(range(4)))
     agent.network.flat[:, 24:28] = -10.0  # biases of the first four units
     earlier = agent.state_dict()
