@@ -62,6 +62,12 @@ def test_recordings_are_those_of_the_results_on_the_pages_and_rates_are_bounded(
     assert (made.growth.mean(), made.growth.std()) == pytest.approx((0.0276239098, 0.000634965754), rel=1e-6)
 
 
+def test_recordings_without_a_word_are_those_of_the_pages() -> None:
+    made = simulate(second_simulator.Conditions(), 5, 6)
+    found = (made.od.mean(), made.od.std(), made.pump_rate.mean(), made.pump_rate.std())
+    assert found == pytest.approx((0.502748409, 0.0093504282, 0.00986099303, 0.00181733727), rel=1e-6)
+
+
 def test_the_device_s_pi_holds_each_third_at_its_level() -> None:
     stepped = simulate(replace(QUIET, law="setpoint_steps", hours=9), 1, 0)
     np.testing.assert_allclose(stepped.od[0, [179, 359, 539]], [0.8, 0.65, 0.5], rtol=0.01)
