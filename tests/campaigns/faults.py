@@ -7,6 +7,7 @@ through the vendor's web server, task queue, jobs and broker, in real time.
 import logging
 import math
 import time
+from collections.abc import Iterable
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +23,29 @@ from experiments.laws.registry import on_device
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.pioreactor.config import PUBLISHED
 from hardware.safety.config import SafetyConfig
+from tests.campaigns import chibio_faults, pioreactor_faults
 from tests.campaigns.chibio_case import ChiBioCase
 from tests.campaigns.chibio_faults import FAULTY
 from tests.campaigns.fault import FAMILIES, MOMENTS, VIRTUAL, Fault
-from tests.campaigns.fault_table import FAULTS, by_name
 from tests.campaigns.outcome import Outcome, declared, table, totals, write_cases
 from tests.campaigns.pioreactor_case import PioreactorCase
 from tests.campaigns.rehearsal import rehearsed
 from tests.entry import command
 
-__all__ = ["Case", "FaultsConfig", "faults"]
+__all__ = ["FAULTS", "Case", "FaultsConfig", "by_name", "faults"]
+
+FAULTS = (*chibio_faults.FAULTS, *pioreactor_faults.FAULTS)
+
+
+def by_name(names: Iterable[str]) -> tuple[Fault, ...]:
+    """The named faults. Raises: ValueError naming one that does not exist and those that do."""
+    known = {fault.name: fault for fault in FAULTS}
+    wanted = tuple(names)
+    for name in wanted:
+        if name not in known:
+            raise ValueError(f"faults = {name}: no such fault; allowed {', '.join(known)}")
+    return tuple(known[name] for name in wanted)
+
 
 log = logging.getLogger(__name__)
 
@@ -122,8 +136,7 @@ def all_cases(config: FaultsConfig) -> list[Case]:
 def run_all(config: FaultsConfig, folder: Path) -> list[Outcome]:
     """Every case, in order; a bar on a terminal, in a log the first, every 50th and each at the Pioreactor rig.
 
-    Stopped, it leaves those that are done in cases.csv. Each worker is a fresh process, because a limit on file size,
-    which one fault sets, is the process's.
+    Each worker is a fresh process, because a limit on file size, which one fault sets, is the process's.
     """
     cases = all_cases(config)
     with (
@@ -132,18 +145,13 @@ def run_all(config: FaultsConfig, folder: Path) -> list[Outcome]:
         tqdm(total=len(cases), disable=None, unit="case") as bar,
     ):
         futures = [workers.submit(case.run, config, folder) for case in cases]
-        try:
-            for done, future in enumerate(as_completed(futures), 1):
-                o = future.result()
-                bar.update()
-                if bar.disable and (done == 1 or done % 50 == 0):
-                    log.info("%d of %d cases", done, len(cases))
-                if o.family == "pioreactor":
-                    log.info("%s, %s: %s", o.label, o.moment, ", ".join(o.wrong) or "ok")
-        except KeyboardInterrupt:
-            if ended := [f.result() for f in futures if f.done() and f.exception() is None]:
-                write_cases(folder / "cases.csv", ended)
-            raise
+        for done, future in enumerate(as_completed(futures), 1):
+            o = future.result()
+            bar.update()
+            if bar.disable and (done == 1 or done % 50 == 0):
+                log.info("%d of %d cases", done, len(cases))
+            if o.family == "pioreactor":
+                log.info("%s, %s: %s", o.label, o.moment, ", ".join(o.wrong) or "ok")
         return [future.result() for future in futures]
 
 

@@ -83,37 +83,14 @@ def deployed(config: RigStudyConfig, folder: Path) -> Path:
     return folder / "run"
 
 
-def found_in(run: Recorded) -> list[UnitTruth]:
-    """Every unit."""
-    found = []
-    for unit in run.volume_ml:
-        spans = rig_truth.phases(run.journal, unit)
-        windows = tuple(rig_truth.held(span, run.truth, unit, run.speed) for span in spans)
-        doses = rig_truth.account(run.journal, run.truth, unit)
-        found.append(UnitTruth(unit, windows, rig_truth.vial(run.truth, unit), doses))
-    return found
-
-
 def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
     """table.md: how the setpoints were held, and what became of the doses."""
     head = ("unit", "setpoint", f"mean error, last {rig_truth.LAST_MIN:.0f} min")
-    rows = [(u.unit, f"{h.setpoint:g}", f"{h.last_error_od:.4f}") for u in found for h in u.held]
+    rows = [(u.unit, f"{setpoint:g}", f"{error:.4f}") for u in found for setpoint, error in u.held]
     doses = (
-        "unit",
-        "doses",
-        "runs of the pump",
-        "error, mL: mean",
-        "largest",
-        "outside of the bound, mL",
-        "cut short",
-        "without intent",
-        "twice",
-        "missing",
-        "given, mL",
-        "booked, mL",
-        "difference",
-        "largest volume, mL",
-    )
+        "unit", "doses", "runs of the pump", "error, mL: mean", "largest", "outside of the bound, mL", "cut short",
+        "without intent", "twice", "missing", "given, mL", "booked, mL", "difference", "largest volume, mL",
+    )  # fmt: skip
     said = [f"Growth {run.speed:g} times faster than real time.", ""]
     return "\n".join([*said, markdown(head, rows), markdown(doses, map(_dose_row, found))])
 
@@ -123,7 +100,7 @@ def _dose_row(u: UnitTruth) -> tuple[str, ...]:
     return (
         u.unit, str(a.asked), str(a.runs), f"{a.error_mean_ml:+.4f}", f"{a.error_max_ml:.4f}", number(a.outside_ml, 2),
         str(a.cut), str(a.without_intent), str(a.twice), str(a.missing), f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}",
-        f"{a.total_pct:+.2f} %", f"{u.vial.peak_ml:.2f}",
+        f"{a.total_pct:+.2f} %", f"{u.peak_ml:.2f}",
     )  # fmt: skip
 
 
@@ -131,7 +108,7 @@ def rig_study(config: RigStudyConfig, folder: Path) -> None:
     """Run, or take a run that is there; table, summary.json. Raises: UserError where a limit is not met."""
     began = time.monotonic()
     run = recorded(Path(config.run) if config.run else deployed(config, folder))
-    found = found_in(run)
+    found = [rig_truth.found_in(run.journal, run.truth, unit, run.speed) for unit in run.volume_ml]
     wrong = [line for u in found for line in rig_truth.trouble(u, config.limits, run.volume_ml[u.unit])]
     units = {u.unit: {key: value for key, value in asdict(u).items() if key != "unit"} for u in found}
     summary = {"met": not wrong, "speed": run.speed, "not_met": wrong}

@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 
-__all__ = [
-    "Account", "Dose", "Held", "Limits", "Span", "UnitTruth", "Vial", "account", "asked", "held", "phases", "trouble",
-    "vial",
-]  # fmt: skip
+__all__ = ["Account", "Dose", "Limits", "UnitTruth", "account", "found_in", "trouble"]
 
 Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
@@ -44,23 +41,6 @@ class Limits:
 
     def __post_init__(self) -> None:
         check(self, "limits")
-
-
-@dataclass(frozen=True)
-class Span:
-    """A setpoint, OD, that was to be held from `start` to `end`."""
-
-    setpoint: float
-    start: float
-    end: float
-
-
-@dataclass(frozen=True)
-class Held:
-    """Mean distance, OD, of the true OD from a setpoint in the last `LAST_MIN` of its window; nan: not on record."""
-
-    setpoint: float
-    last_error_od: float
 
 
 @dataclass(frozen=True)
@@ -107,20 +87,17 @@ class Account:
 
 
 @dataclass(frozen=True)
-class Vial:
-    """Largest volume in a vial, mL, and whether its pumps are off at last."""
-
-    peak_ml: float
-    pumps_off: bool
-
-
-@dataclass(frozen=True)
 class UnitTruth:
-    """All that is found of one unit."""
+    """All that is found of one unit.
+
+    held: of each window its setpoint, and the mean distance of the true OD from it in its last `LAST_MIN`, OD; nan: not
+    on record. peak_ml: largest volume in the vial. pumps_off: at last.
+    """
 
     unit: str
-    held: tuple[Held, ...]
-    vial: Vial
+    held: tuple[tuple[float, float], ...]
+    peak_ml: float
+    pumps_off: bool
     account: Account
 
 
@@ -132,16 +109,16 @@ def of_unit(rows: Rows, unit: str, key: str = "unit") -> list[Mapping[str, Any]]
     return [row for row in rows if row.get(key) == unit]
 
 
-def phases(journal: Rows, unit: str) -> list[Span]:
-    """The windows of a unit's schedule by its decisions, without the recovery before them; the last ends with its rows.
+def windows(journal: Rows, unit: str) -> list[tuple[float, float, float]]:
+    """Setpoint, begin and end of each window of a unit's schedule by its decisions, without the recovery before them.
 
-    Args: journal: rows of all units.
+    The last one ends with the unit's rows.
     """
     mine = of_unit(journal, unit, "reactor")
     decided = [(row["wall"], row["row"]) for row in mine if row["kind"] == "decision" and row["row"]["phase"] >= 0]
     first = [next(group) for _, group in itertools.groupby(decided, key=lambda each: each[1]["phase"])]
     ends = [*(wall for wall, _ in first[1:]), mine[-1]["wall"] if mine else math.nan]
-    return [Span(row["setpoint"], wall, end) for (wall, row), end in zip(first, ends, strict=False) if end > wall]
+    return [(row["setpoint"], wall, end) for (wall, row), end in zip(first, ends, strict=False) if end > wall]
 
 
 def media_runs(truth: Rows, unit: str) -> tuple[Array, Array]:
@@ -168,24 +145,22 @@ def asked(journal: Rows, unit: str) -> list[Dose]:
 # -- judged by the truth -----------------------------------------------------------------------------------------------
 
 
-def held(span: Span, truth: Rows, unit: str, speed: float) -> Held:
-    """One window. Args: truth: rows of all units. speed: device seconds per real second."""
-    seen = [(row["wall"], row["od"]) for row in of_unit(truth, unit) if "od" in row]
-    wall, od = np.array(seen, dtype=np.float64).reshape(-1, 2).T
-    last = (wall >= max(span.start, span.end - LAST_MIN * 60.0 / speed)) & (wall < span.end)
-    return Held(span.setpoint, _mean(np.abs(od[last] - span.setpoint)))
+def found_in(journal: Rows, truth: Rows, unit: str, speed: float) -> UnitTruth:
+    """One unit. Args: journal, truth: rows of all units. speed: device seconds per real second."""
+    seen = np.array([(r["wall"], r["od"]) for r in of_unit(truth, unit) if "od" in r], dtype=np.float64)
+    wall, od = seen.reshape(-1, 2).T
+    held = []
+    for setpoint, start, end in windows(journal, unit):
+        last = (wall >= max(start, end - LAST_MIN * 60.0 / speed)) & (wall < end)
+        held.append((setpoint, _mean(np.abs(od[last] - setpoint))))
+    vial = [row for row in of_unit(truth, unit) if "volume_ml" in row]
+    peak_ml = max((float(row["peak_ml"]) for row in vial), default=math.nan)
+    off = bool(vial) and not any(vial[-1]["duty"].values())
+    return UnitTruth(unit, tuple(held), peak_ml, off, account(journal, truth, unit))
 
 
 def _mean(values: Array) -> float:
     return float(values.mean()) if values.size else math.nan
-
-
-def vial(truth: Rows, unit: str) -> Vial:
-    """What is to be said of a vial; nan where it is in no row."""
-    rows = [row for row in of_unit(truth, unit) if "volume_ml" in row]
-    if not rows:
-        return Vial(math.nan, False)
-    return Vial(max(float(row["peak_ml"]) for row in rows), not any(rows[-1]["duty"].values()))
 
 
 def account(journal: Rows, truth: Rows, unit: str) -> Account:
@@ -239,13 +214,13 @@ def _booked(journal: Rows, doses: Sequence[Dose], unit: str) -> float:
 def trouble(found: UnitTruth, limits: Limits, volume_ml: float) -> list[str]:
     """What a unit did not keep, one line each. Args: volume_ml: up to the waste tube."""
     lines = [] if found.held else ["no window of its schedule is on record"]
-    for each in found.held:
-        if not each.last_error_od <= limits.error_od:
-            said = f"mean |OD - setpoint| of the last {LAST_MIN:.0f} min at {each.setpoint:g} is"
-            lines.append(f"{said} {each.last_error_od:.4f} (allowed {limits.error_od:g})")
-    if not found.vial.peak_ml - volume_ml <= limits.volume_ml:
-        lines.append(f"{found.vial.peak_ml:.2f} mL in the vial (allowed {volume_ml:g} + {limits.volume_ml:g})")
-    if not found.vial.pumps_off:
+    for setpoint, error in found.held:
+        if not error <= limits.error_od:
+            said = f"mean |OD - setpoint| of the last {LAST_MIN:.0f} min at {setpoint:g} is"
+            lines.append(f"{said} {error:.4f} (allowed {limits.error_od:g})")
+    if not found.peak_ml - volume_ml <= limits.volume_ml:
+        lines.append(f"{found.peak_ml:.2f} mL in the vial (allowed {volume_ml:g} + {limits.volume_ml:g})")
+    if not found.pumps_off:
         lines.append("a pump is on at the end")
     return [f"{found.unit}: {line}" for line in lines + _accounted(found.account, limits)]
 

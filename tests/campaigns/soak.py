@@ -224,12 +224,7 @@ def soak(config: SoakConfig, folder: Path) -> None:
     """Run, table, summary.json. Raises: UserError if something was lost, grew or drifted."""
     days: list[Day] = []
     began = time.monotonic()
-    try:
-        found = soak_run(config, folder, days)
-    except KeyboardInterrupt:
-        if days:
-            write_table(days, folder)
-        raise
+    found = soak_run(config, folder, days)
     slopes = {key: round(growth(days, key), 2) for key in ("memory_mb", "journal_mb", "csv_mb", "events_mb")}
     wall = round(time.monotonic() - began, 1)
     summary = {**found, "growth_per_day": slopes, "wall_s": wall, "days": [asdict(d) for d in days]}

@@ -36,21 +36,14 @@ def logit(share):
 
 @pytest.mark.parametrize("dosing", ["continuous", "pulse"])
 def test_the_logit_of_the_share_falls_by_the_difference_of_the_rates(dosing) -> None:
-    p = plant(pair(pump=replace(PlantConfig().pump, dosing=dosing)), n=3)
+    """Whatever is fed and evaporates."""
+    pump, vessel = replace(PlantConfig().pump, dosing=dosing), VesselConfig(evaporation_ml_day=50.0)
+    p = plant(pair(pump=pump, vessel=vessel), n=3)
     p.reset(share=np.array([0.1, 0.5, 0.9]))
     start = logit(p.culture.share)
     for _ in range(60):
         p.advance(1.0, np.array([0.0, 0.3, 1.2]))
     np.testing.assert_allclose(logit(p.culture.share) - start, 60 * (0.01 - 0.02), rtol=1e-6)
-
-
-def test_dilution_and_evaporation_leave_the_share() -> None:
-    still = pair(growth=GrowthConfig(mu=0.0), vessel=VesselConfig(evaporation_ml_day=50.0))
-    p = plant(replace(still, second=replace(still.second, mu=0.0, start_share=(0.3, 0.3))))
-    for _ in range(30):
-        p.advance(1.0, np.array([1.0]))
-    assert p.culture.share[0] == pytest.approx(0.3, rel=1e-12)
-    assert p.culture.od[0] < 0.2
 
 
 def test_both_eat_the_same_medium_and_share_the_wall() -> None:
@@ -139,11 +132,6 @@ def test_production_answers_at_once_and_overshoots_after_the_delay() -> None:
     assert done[29] == pytest.approx(0.8, rel=1e-9)
     assert done[44] == pytest.approx(0.8 + 0.4 * (1.0 - 0.2), abs=0.01)
     assert 1.05 < max(done) < 1.6
-
-
-def test_production_never_falls_below_its_floor() -> None:
-    light = plant(pair()).fluorescence
-    light.reset(np.array([0.2]), np.array([0.01]), np.array([32.0]))
     for _ in range(120):
         light.new_minute(np.array([36.0]))
         assert light.production[0] >= 20.0

@@ -15,17 +15,28 @@ from envs.task import EnvConfig, step_factors
 from envs.vector_env import BioreactorVectorEnv
 
 ID = "Bioreactor-v0"
+LENGTHS = {ID: 100, "BioreactorPreview-v0": 12, "Coculture-v0": 72, "CoculturePreview-v0": 24, "Relative-v0": 20}
 assert envs.__doc__
 
 
-def test_gymnasium_checks_the_single_environment():
-    check_env(gymnasium.make(ID).unwrapped)
-
-
-def test_make_vec_gives_the_native_environment():
-    env = gymnasium.make_vec(ID, num_envs=3)
-    assert isinstance(env.unwrapped, BioreactorVectorEnv)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+@pytest.mark.filterwarnings("ignore:.*Box observation space m")  # a relative error has no bound
+@pytest.mark.parametrize("name", sorted(REGISTERED))
+def test_a_task_is_what_gymnasium_asks_and_continues_from_its_state(name):
+    """Also from the step that ended an episode, whose last observation is told beside the first one of the next."""
+    check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
+    assert gymnasium.make(name).spec.max_episode_steps == LENGTHS[name]
+    many, other = (gymnasium.make_vec(name, num_envs=3, episode_steps=4).unwrapped for _ in range(2))
+    assert many.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert many.reset(seed=4)[0] in many.observation_space
+    for k in range(4):
+        observation, _, terminated, truncated, infos = many.step(np.full(3, 5 * k))
+        assert not terminated.any()
+        assert truncated.all() == (k == 3)
+    assert (observation != infos["final_obs"]).any(axis=1).all()
+    other.reset(seed=9)
+    np.testing.assert_array_equal(other.load_state_dict(many.state_dict()), observation)
+    for action in (0, 16, 5, 5, 8, 1, 2, 3, 4):
+        np.testing.assert_array_equal(many.step(np.full(3, action))[0], other.step(np.full(3, action))[0])
 
 
 def pair(n, mode, **overrides):
@@ -116,13 +127,9 @@ def test_gymnasiums_own_time_limit_shortens_episodes():
 
 @pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_a_way_to_draw_that_does_not_exist_is_refused(make):
+def test_a_way_to_draw_is_refused_and_who_asks_for_a_picture_told_that_there_is_none(make):
     with pytest.raises(TypeError, match="render_mode = human: allowed None"):
         make(ID, render_mode="human")
-
-
-@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_who_asks_for_a_picture_is_told_that_there_is_none(make):
     env = make(ID)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="this environment has nothing to draw"):

@@ -33,7 +33,7 @@ MODELS = [  # mu 1/min, tau, control period min, largest pump rate mL/s
 def loop(policy: Policy | None, model: tuple[float, ...], steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Sum of e^2, and |x - r| over the last 30 steps at each setpoint; x' = (mu - u/tau) x exactly, e and s known.
 
-    None is the one-line controller, which is the optimum of these sums (tests/envs/test_relative.py).
+    None is the one-line controller, which is the optimum of these sums (tests/envs/test_optimum.py).
     """
     mu, tau, period, fastest = model
     full_pump = fastest * period / tau

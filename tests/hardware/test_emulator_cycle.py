@@ -1,5 +1,6 @@
-"""The experiment cycle: timing, records, start and stop races (docs/device.md, Cycle, Records and Start races)."""
+"""The experiment cycle: timing, records, start and stop races, the turbidostat on board (docs/device.md)."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -151,24 +152,12 @@ def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
     assert isinstance(lab.peek()["Experiment"]["startTimeRaw"], str)
 
 
-def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
+@pytest.mark.parametrize("path", ["/Experiment/0/M0", "/Experiment/1/M0"])  # a second start stops
+def test_a_stop_switches_pumps_1_and_2_off_at_once_and_the_end_of_its_cycle_all_else(path: str) -> None:
+    """Pumps 3 and 4, and what was started meanwhile."""
     lab = running(wait=20.0)
     for pump in (1, 2, 3, 4):
         lab.pump(f"Pump{pump}", 0.3)
-    lab.post("/Experiment/0/M0")
-    state = lab.state()
-    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 1, 1]
-    assert state["OD"]["ON"] == 0
-    assert "Stopped" not in state["Terminal"]["text"]
-    lab.wait_until(61.0)  # the thread slept out its cycle
-    state = lab.state()
-    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
-    assert "Experiment Stopped" in state["Terminal"]["text"].split("</br>")[0]
-
-
-@pytest.mark.parametrize("path", ["/Experiment/0/M0", "/Experiment/1/M0"])  # a second start stops
-def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile(path: str) -> None:
-    lab = running(wait=20.0)
     lab.post(path)
     seen = [lab.state()]
     lab.post("/SetOutputOn/Stir/1/M0")
@@ -176,8 +165,12 @@ def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile(path
     for at in (58.0, 62.0):
         lab.wait_until(at)
         seen.append(lab.state())
-    items = ("Experiment", "Thermostat", "Stir")
-    assert [[state[item]["ON"] for item in items] for state in seen] == [[0, 0, 0], [0, 1, 1], [0, 0, 0]]
+    items = ("Pump1", "Pump2", "Pump3", "Pump4", "OD", "Experiment", "Thermostat", "Stir")
+    assert [[state[item]["ON"] for item in items] for state in seen] == [
+        [0, 0, 1, 1, 0, 0, 0, 0], [0, 0, 1, 1, 0, 0, 1, 1], [0] * 8,
+    ]  # fmt: skip
+    said = [state["Terminal"]["text"].partition("</br>")[0] for state in seen]
+    assert ["Stopped" in text for text in said] == [False, False, True]
 
 
 def test_stop_in_the_first_five_seconds_takes_the_cycle_back() -> None:
@@ -277,3 +270,98 @@ def test_each_record_has_its_own_value_and_nothing_of_what_is_off() -> None:
     assert data["Pump2"]["record"] == [0.0]
     for name, values in (("FP1", [0, 0, 0]), ("FP2", [200, 0.5, 0.25]), ("FP3", [0, 0, 0])):
         assert [data[name][f"{key}Record"][0] for key in ("Base", "Emit1", "Emit2")] == values
+
+
+def regulate(lab: Lab, target: float) -> None:
+    lab.post(f"/SetOutputTarget/OD/M0/{target}")
+    lab.post("/Experiment/1/M0")
+    lab.post("/SetOutputOn/OD/1/M0")
+
+
+def after_regulation(lab: Lab, cycle: int) -> None:
+    """Just after the regulator of a cycle has run, before the next record."""
+    lab.wait_until(60.07 * (cycle - 1) + 10.3)
+
+
+def law(data: dict, previous: float, integrals: tuple[float, float]) -> tuple[float, float, float]:  # type: ignore[type-arg]
+    """Feed duty, integral 1, integral 2 as docs/device.md words it, from what the client can see."""
+    x, r, v = data["OD"]["current"], data["OD"]["target"], data["Volume"]["target"]
+    t = data["time"]["record"]
+    p = math.log(x / r) / ((t[-1] - t[-2]) / 60.0) / (240.0 / v) if x > 0 else 0.0
+    e, d = x - r, x - previous
+    i1, i2 = integrals
+    if e < 0.01:
+        i1 = 0.0
+    elif abs(d) < 0.05 and e > 0.025:
+        i1 += 0.1 * e
+    if abs(e) > 0.1 and abs(d) < 0.05:
+        i2 = 0.0
+    elif abs(d) < 0.1:
+        i2 += 0.01 * e
+        p *= 0.7
+    duty = 0.0 if d > 0.04 else p + i1 + i2
+    return min(max(duty, 0.0), 0.02), i1, i2
+
+
+@pytest.mark.parametrize(
+    ("od", "mu"), [(0.8, 0.0), (0.58, 0.0), (0.51, 0.0), (0.65, 0.0), (0.2, 0.0), (0.4, 0.03), (0.48, 0.03)]
+)
+def test_law_cycle_by_cycle(od: float, mu: float) -> None:
+    """The first two cycles feed nothing; from the 16th on the waste pump rests where nothing was fed."""
+    lab = Lab(od=od, mu=mu, blanked=True)
+    regulate(lab, 0.5)
+    integrals, duties = (0.0, 0.0), list[float]()
+    for cycle in range(1, 19):
+        after_regulation(lab, cycle)
+        data = lab.peek()
+        assert data["Experiment"]["cycles"] == cycle
+        duty = 0.0
+        if cycle > 2:
+            duty, *new = law(data, data["OD"]["record"][-1], integrals)
+            integrals = (new[0], new[1])
+        duties.append(duty)
+        rests = cycle > 15 and not (duty or any(duties[-11:-2]))
+        assert data["Pump1"]["target"] == pytest.approx(duty)
+        assert (data["OD"]["Integral"], data["OD"]["Integral2"]) == pytest.approx(integrals)
+        waste = 0.25 if cycle % 5 == 1 else 4 * duty + 0.07
+        assert data["Pump2"]["target"] == pytest.approx(0.0 if rests else waste)
+        assert (data["Pump1"]["ON"], data["Pump2"]["ON"]) == (int(duty > 0), int(not rests))
+    assert len(set(duties)) > 2 or od in (0.2, 0.4)
+
+
+OTHERS = ["a jump upwards", "the mode of a chemostat, whose rate no route can set", "a target that is never reached"]
+
+
+@pytest.mark.parametrize("how", OTHERS)
+def test_what_stops_the_feed_for_a_cycle(how: str) -> None:
+    """OD.target 0 pumps at the cap at the next measurement, 10 does not (docs/device.md, Dosing)."""
+    lab = Lab(od=0.6, blanked=True)
+    regulate(lab, 0.0 if "target" in how else 0.5)
+    after_regulation(lab, 5)
+    assert lab.peek()["Pump1"]["target"] == 0.02 if "target" in how else lab.peek()["Pump1"]["target"] > 0.0
+    if "jump" in how:
+        lab.device.vials["M0"].faults.od_jump = 0.1
+    else:
+        lab.post("/SetOutputTarget/OD/M0/10" if "target" in how else "/SetOutputOn/Chemostat/1/M0")
+    after_regulation(lab, 6)
+    assert lab.peek()["Pump1"]["target"] == 0.0
+
+
+def test_od_on_without_experiment_does_nothing() -> None:
+    lab = Lab(od=0.8)
+    lab.post("/SetOutputOn/OD/1/M0")
+    lab.wait(600.0)
+    assert lab.doses() == []
+
+
+def test_closed_loop_brings_061_to_050_in_a_few_cycles_and_holds_it() -> None:
+    """Behaviour of the real software with a 1 mL/s pump: 5 cycles, then mean 0.502, sd 0.007 (docs/device.md)."""
+    lab = Lab(od=0.61, mu=0.03, blanked=True)
+    regulate(lab, 0.5)
+    lab.wait(8 * 60.07)
+    assert lab.state()["OD"]["record"][-1] == pytest.approx(0.5, abs=0.04)
+    lab.wait(170 * 60.07)
+    held = np.array(lab.state()["OD"]["record"][-120:])
+    assert held.mean() == pytest.approx(0.502, abs=0.015)
+    assert held.std() < 0.015
+    assert lab.device.truth("M0")["peak_ml"] < 23.0

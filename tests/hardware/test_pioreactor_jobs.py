@@ -182,15 +182,12 @@ def test_the_vendors_turbidostat_is_told_readings_of_its_own_scale_and_the_chann
     assert overrides == [["turbidostat.config", "signal_channel", "1"]]
 
 
-def test_readings_are_asked_for_as_often_as_the_run_wants_them_and_without_smoothing() -> None:
+@pytest.mark.parametrize(("reading_s", "rate"), [(5.0, "0.2"), (8.0, "0.125")])
+def test_readings_are_asked_for_as_often_as_the_run_wants_them_and_without_smoothing(reading_s, rate):
     """One smoothed reading in five seconds would lag behind every dose."""
-    for reading_s, rate in ((5.0, "0.2"), (8.0, "0.125")):
-        options, overrides = request("od_reading", PioreactorConfig(reading_s=reading_s), facts("26.7.2"), 37.0, np.nan)
-        assert options == {}
-        assert sorted(overrides) == [
-            ["od_reading.config", "samples_per_second", rate],
-            ["od_reading.config", "smoothing_penalizer", "0"],
-        ]
+    options, overrides = request("od_reading", PioreactorConfig(reading_s=reading_s), facts("26.7.2"), 37.0, np.nan)
+    asked = [["samples_per_second", rate], ["smoothing_penalizer", "0"]]
+    assert (options, sorted(overrides)) == ({}, [["od_reading.config", *each] for each in asked])
 
 
 class Said:

@@ -229,13 +229,18 @@ def test_concatenated_runs(read: Read, header: str) -> None:
         assert read(tidy() + tidy(OD[:3], T[:3], U[:3]) + f"{header}\n").runs == ((0, 39), (40, 42))
 
 
-def test_one_reactor_of_several(read: Read) -> None:
-    lines = [f"{m},{t!r},{y + 0.1 * m!r},0.0" for t, y in zip(T.tolist(), OD.tolist(), strict=True) for m in (0, 1)]
-    content = "\n".join(["reactor,time_min,od,pump_rate_ml_s", *lines]) + "\n"
-    np.testing.assert_allclose(read(content, reactor="1").od, OD + 0.1)
+def test_one_reactor_of_several_is_taken_by_its_name_and_a_row_cut_off_before_it_noted(read: Read) -> None:
+    lines = [f"{t!r},{y + 0.1 * m!r},0.0,M{m}" for t, y in zip(T.tolist(), OD.tolist(), strict=True) for m in (0, 1)]
+    content = "\n".join(["time_min,od,pump_rate_ml_s,reactor", *lines]) + "\n"
+    np.testing.assert_allclose(read(content, reactor="M1").od, OD + 0.1)
     first = read(content)
     np.testing.assert_allclose(first.od, OD)
-    assert first.notes == ("reactor 0 taken; the file also holds 1",)
+    assert first.notes == ("reactor M0 taken; the file also holds M1",)
+    cut = read(content.replace(lines[5], lines[5].rsplit(",", 2)[0]), reactor="M1")
+    assert cut.row.tolist() == [i for i in range(1, 80, 2) if i != 5]
+    assert cut.notes[:2] == ("reactor M1 taken; the file also holds M0", "row 5: fewer than 4 columns: dropped")
+    with pytest.raises(RecordingError, match="reactor = M5: allowed is one of M0, M1, which the file holds"):
+        read(content, reactor="M5")
 
 
 # ---------------------------------------------------------------- reading what is bad
@@ -474,20 +479,6 @@ def test_dates_without_an_offset_know_no_summer_time(read: Read, monkeypatch: py
         monkeypatch.undo()
         time.tzset()
     np.testing.assert_allclose(r.time_min, SLOW_T, atol=1e-6)
-
-
-def test_a_row_cut_off_before_its_reactor_is_noted(read: Read) -> None:
-    lines = [f"{line},{'reactor' if not i else f'M{i % 2}'}" for i, line in enumerate(known().splitlines())]
-    lines[5] = lines[5].rsplit(",", 2)[0]
-    r = read("\n".join(lines) + "\n", reactor="M1")
-    assert r.row.tolist() == [i for i in range(0, 60, 2) if i != 4]
-    assert r.notes[:2] == ("reactor M1 taken; the file also holds M0", "row 4: fewer than 4 columns: dropped")
-
-
-def test_a_reactor_that_is_not_there_is_named(read: Read) -> None:
-    content = "reactor," + known().replace("\n", "\nM4,").removesuffix("M4,")
-    with pytest.raises(RecordingError, match="reactor = M5: allowed is one of M4, which the file holds"):
-        read(content, reactor="M5")
 
 
 def test_a_clock_that_restarts_parts_a_recording_whatever_stood_behind_it_before(read: Read) -> None:

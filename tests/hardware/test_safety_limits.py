@@ -445,31 +445,24 @@ def test_ages_follow_the_period_of_the_bench() -> None:
         Interlock(1, SafetyConfig(stale_s=100.0), Bench(period_s=150.0))
 
 
-def test_each_vial_has_its_own_level() -> None:
-    """The ledger is full 5 mL above each tube, and at what a vial holds where that is less."""
-    tubes = np.array([12.0, 20.0, 28.0])
-    interlock, fed = Interlock(3, SafetyConfig(ml_per_minute=1e3), Bench(volume_ml=12.0), tubes, 30.0), np.zeros(3)
+def test_each_vial_has_its_own_level_and_dilution() -> None:
+    """The ledger is full 5 mL above each tube, and at what a vial holds where that is less. And 5 mL into 5 mL leave
+    exp(-1) of an OD of 0.8, 0.29; into 20 mL they leave 0.62, and 0.29 is no culture's."""
+
+    def look(interlock: Interlock, minute: int, od: float, rate: float = 0.0) -> Any:
+        n = len(interlock.budget.fed_ml)
+        m = Measurement(np.full(n, 60.0 * minute), np.full(n, od), np.full(n, 37.0), np.full(n, True), None)
+        return interlock.check(m, np.full(n, rate), np.full(n, 0.5), np.full(n, np.nan), 60.0 * minute)
+
+    full = Interlock(3, SafetyConfig(ml_per_minute=1e3), Bench(volume_ml=12.0), np.array([12.0, 20.0, 28.0]), 30.0)
     for k in range(40):
-        now = np.full(3, 60.0 * k)
-        m = Measurement(now, np.full(3, 0.5 + 0.001 * (k % 7)), np.full(3, 37.0), np.full(3, True), None)
-        rate = interlock.check(m, np.full(3, 0.01), np.full(3, 0.5), np.full(3, np.nan), now[0]).rate
-        interlock.confirm(Receipt(60.0 * rate, (), np.zeros(3)), now[0])
-        fed += 60.0 * rate
-    assert fed.tolist() == pytest.approx([4.8, 4.8, 1.8])
-
-
-def test_a_fall_is_judged_by_the_volume_of_its_own_vial() -> None:
-    """5 mL into 5 mL leave exp(-1) of an OD of 0.8, 0.29; into 20 mL they leave 0.62, and 0.29 is no culture's."""
-    interlock = Interlock(2, SafetyConfig(), Bench(volume_ml=20.0), np.array([5.0, 20.0]))
-
-    def kinds(minute: int, od: list[float]) -> tuple[tuple[str, ...], ...]:
-        now = np.full(2, 60.0 * minute)
-        m = Measurement(now, np.array(od), np.full(2, 37.0), np.full(2, True), None)
-        return interlock.check(m, np.zeros(2), np.full(2, 0.5), np.full(2, np.nan), now[0]).kinds
-
-    assert kinds(0, [0.8, 0.8]) == ((), ())
-    interlock.confirm(Receipt(np.full(2, 5.0), (), np.full(2, 20.0)), 0.0)
-    assert kinds(1, [0.294, 0.294]) == ((), ("falls",))
+        rate = look(full, k, 0.5 + 0.001 * (k % 7), 0.01).rate
+        full.confirm(Receipt(60.0 * rate, (), np.zeros(3)), 60.0 * k)
+    assert full.budget.fed_ml.tolist() == pytest.approx([4.8, 4.8, 1.8])
+    thinned = Interlock(2, SafetyConfig(), Bench(volume_ml=20.0), np.array([5.0, 20.0]))
+    assert look(thinned, 0, 0.8).kinds == ((), ())
+    thinned.confirm(Receipt(np.full(2, 5.0), (), np.full(2, 20.0)), 0.0)
+    assert look(thinned, 1, 0.294).kinds == ((), ("falls",))
 
 
 # -- conclusions -----------------------------------------------------------------------------------------------------

@@ -122,16 +122,9 @@ class Drawn:
 
     def __init__(
         self,
-        rng: np.random.Generator,
-        n: int,
-        *,
-        every: float,
-        top: float,
-        bounds: tuple[float, float],
-        warm_min: float = 0.0,
-        washed: float = np.inf,
-        levels: int = 0,
-    ) -> None:
+        rng: np.random.Generator, n: int, *, every: float, top: float, bounds: tuple[float, float],
+        warm_min: float = 0.0, washed: float = np.inf, levels: int = 0,
+    ) -> None:  # fmt: skip
         self.rng, self.every, self.top, self.bounds = rng, every, top, bounds
         self.warm_min, self.washed, self.levels = warm_min, washed, levels
         self.rate, self.drawn = np.zeros(n), np.full(n, -np.inf)
@@ -225,10 +218,5 @@ def simulate(conditions: Conditions, n: int, seed: int) -> Recordings:
         if row < c.rows - 1:
             culture.row(rates[row], dose[row])
             hidden = c.late_share * rates[row] * dose[row] / c.tau
-    return Recordings(
-        time=time,
-        od=np.ascontiguousarray(od.T),
-        pump_rate=np.ascontiguousarray(rates.T),
-        growth=culture.grown / (c.rows - 1),
-        tau=np.full(n, c.tau),
-    )
+    growth_rate = culture.grown / (c.rows - 1)
+    return Recordings(time, np.ascontiguousarray(od.T), np.ascontiguousarray(rates.T), growth_rate, np.full(n, c.tau))

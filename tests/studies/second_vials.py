@@ -267,22 +267,12 @@ def run(
         on = (od > DOSE_UP) | (on & (od > DOSE_DOWN))
         told = np.where(on, DOSE_ML, 0.0)
         true = told * c.flow * np.maximum(0.0, 1 + c.dose_spread * noise[3])
-        now = Trace(
-            share=vials.share,
-            estimate=belief["ratio"],
-            low=belief["ratio_low"],
-            high=belief["ratio_high"],
-            temperature=vials.temperature,
-            thermometer=thermometer,
-            target=target,
-            od=od,
-            counts=counts,
-            setpoint=wanted.setpoint,
-            told_ml=told,
-            true_ml=true,
-        )
-        for name, values in vars(now).items():
-            trace[name][row] = values
+        now = (
+            vials.share, belief["ratio"], belief["ratio_low"], belief["ratio_high"], vials.temperature, thermometer,
+            target, od, counts, wanted.setpoint, told, true,
+        )  # fmt: skip
+        for column, values in zip(trace.values(), now, strict=True):
+            column[row] = values
         estimator.dosed(told)
         vials.pass_minute(target, true, noise[4:])
     return Trace(**trace)
