@@ -151,17 +151,16 @@ def opened(target: str, run: Path, resumed: bool) -> Notifier:
     Raises: UserError for a variable that is not set, unless the run is resumed: a culture waits for that, so it goes
       on untold and says so.
     """
-    if target.startswith("env:"):
-        name = target.removeprefix("env:")
-        target = os.environ.get(name, "").strip()
-        if not target:
-            if not resumed:
-                raise messages.NotSet(name=name)
-            log.warning(messages.HookUnusable(why=messages.NotSet(name=name)))
     try:
-        return Notifier(Hook(target) if target else None, run)
+        if target.startswith("env:"):
+            name = target.removeprefix("env:")
+            target = os.environ.get(name, "").strip()
+            if not target:
+                raise messages.NotSet(name=name)
+        hook = Hook(target) if target else None
     except frame.UserError as error:
         if not resumed:
             raise
         log.warning(messages.HookUnusable(why=error))
-        return Notifier(None, run)
+        hook = None
+    return Notifier(hook, run)

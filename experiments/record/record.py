@@ -9,7 +9,6 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +82,7 @@ class Record:
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
         self._paths, self.columns, self._gone = paths, tuple(columns), set[Path]()
         self.rows = [read_rows(path, columns) for path in paths]
-        self.repairs += self._completed(self.journal.rows)
+        self.repairs += complete(self.journal.rows, self.names, self.rows, self._write)
         began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
         newest = max((float(rows.columns["time_min"][-1]) for rows in self.rows if len(rows)), default=-1.0)
         self.curves = Curves(self.folder, self.names, columns, round(newest) + 1, began)
@@ -95,7 +94,7 @@ class Record:
         Raises: RecordingError.
         """
         self.rows, journal = [read_rows(path, self.columns) for path in self._paths], self.journal.reread()
-        self._completed(journal)
+        complete(journal, self.names, self.rows, self._write)
         for n, name in enumerate(self.names):
             closed = {"n": self.journal.next_row, "kind": "closed", "reactor": name}
             if any(row["kind"] == "intent" for row in journal) and (
@@ -104,13 +103,6 @@ class Record:
                 self.journal.append("closed", {"reactor": name})
                 self._recorders[n].amend(row)
                 self.rows[n] = read_rows(self._paths[n], self.columns)
-
-    def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[Message]:
-        """Complete recordings from the rows of the journal; return a message for each."""
-        lines = list[Message]()
-        for n, name in enumerate(self.names):
-            lines += complete(journal, name, self.rows[n], partial(self._write, n))
-        return lines
 
     def _write(self, n: int, row: Row) -> None:
         self._recorders[n].write(row)

@@ -121,21 +121,22 @@ def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
 
 
 def complete(
-    journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write: Callable[[Row], None]
+    journal: Sequence[Mapping[str, Any]], names: Sequence[str], rows: Sequence[Rows], write: Callable[[int, Row], None]
 ) -> list[Message]:
-    """Write the rows of reactor `name` that are in the journal and that a kill kept from being written.
+    """Write the rows of each reactor that are in the journal and that a kill kept from being written.
 
-    Args: journal: its rows. rows: those already written, into which `write` takes each new one.
+    Args: journal: its rows. rows: of each reactor, those already written, into which `write` takes each new one.
     Returns: one message per row. Raises: RecordingError for a row of the journal that was damaged.
     """
     repairs = list[Message]()
-    try:
-        for row in _unwritten(journal, name, rows):
-            write(row)
-            repairs.append(messages.RowCompleted(reactor=name, minute=row["time_min"]))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
-        raise RowDamaged(path="journal.jsonl", what=what) from None
+    for n, name in enumerate(names):
+        try:
+            for row in _unwritten(journal, name, rows[n]):
+                write(n, row)
+                repairs.append(messages.RowCompleted(reactor=name, minute=row["time_min"]))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
+            raise RowDamaged(path="journal.jsonl", what=what) from None
     return repairs
 
 

@@ -118,15 +118,11 @@ def reasons_line(rows: Rows) -> str:
 
 
 def summarise(
-    table: Recordings,
-    scenarios: Sequence[Scenario],
-    roles: Sequence[str],
-    outcome: str,
-    progress: Progress | None = None,
+    table: Recordings, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str, progress: Progress
 ) -> dict[str, Any]:
     """Every number of a run.
 
-    Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended; None: by its time.
+    Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended.
     """
     volume, minute = np.nansum(table.columns["volume_ml"], axis=1), table.columns["time_min"]
     reactors = {
@@ -142,7 +138,7 @@ def summarise(
     return {
         "outcome": outcome,
         "minutes": float(np.nanmax(minute)) if np.isfinite(minute).any() else 0.0,
-        "windows": _windows(table, scenarios, progress or Progress(scenarios)),
+        "windows": _windows(table, scenarios, progress),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
         "repairs": [str(repair) for repair in table.repairs],

@@ -7,7 +7,7 @@ import base64
 import json
 import platform
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +21,7 @@ from experiments.cli.start import version
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Emphasis, Table, number, typeset
-from experiments.reporting.verdict import Headline, verdict
+from experiments.reporting.verdict import verdict
 
 HERE = Path(__file__).parent
 PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, pattern of its content
@@ -177,11 +177,6 @@ def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
     return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
 
 
-def _told(runs: Iterable[Path]) -> list[Headline]:
-    found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
-    return [said for said in found if said is not None]
-
-
 def _results(page: Page, run: Path, prefix: str) -> None:
     """Add summary.json as tables, whose names begin with `prefix`, and every figure of a run folder.
 
@@ -222,7 +217,8 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     labels = {re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else "": run for run in runs}
     if len(labels) < len(runs):
         labels = {run.name: run for run in runs}
-    told = _told(runs)
+    read = [(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping)]
+    told = [said for each in read if (said := verdict(*each)) is not None]
     if told and "" not in labels:
         page.section("In short")
         page.add("verdicts", found=told)

@@ -20,16 +20,13 @@ from experiments.training.tasks import Task
 log = logging.getLogger(__name__)
 
 
-def _seeds(seeds: Sequence[int]) -> str:
-    return f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} agents, seeds {seeds[0]} to {seeds[-1]}"
-
-
 def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, step: int) -> None:
     """Log the task, its limits, and where to watch. Args: step: first step of a resumed run, else 0."""
     chosen = choices(folder)
     names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
     where = f"continues at step {step} of" if step else "for"
-    log.info("learns %s: %s; %s, %s %d steps", names, task.description, _seeds(seeds), where, config.agent.total_steps)
+    who = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} agents, seeds {seeds[0]} to {seeds[-1]}"
+    log.info("learns %s: %s; %s, %s %d steps", names, task.description, who, where, config.agent.total_steps)
     limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} at rest"
     log.info("target: a policy within %s at its worst setpoint (regret: its cost beyond the exact optimum's)", limits)
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))

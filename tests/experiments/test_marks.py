@@ -19,6 +19,7 @@ from experiments.cli import frame
 from experiments.control.messages import LevelMarked, ShareMarked
 from experiments.control.run import BenchMarks
 from experiments.loop.loop import Step
+from experiments.loop.progress import Progress
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command
 from experiments.record.messages import RowCompleted
@@ -75,7 +76,7 @@ def test_a_reading_that_is_not_believed_counts_for_no_metric(tmp_path: Path) -> 
     wild = od > 5.0
     assert 2 <= wild.sum() <= 5
     assert (record.series("believed")[0] == 0.0)[wild].all()
-    [window] = summarise(record.table(), scenarios, ["policy"], "completed")["windows"]
+    [window] = summarise(record.table(), scenarios, ["policy"], "completed", Progress(scenarios))["windows"]
     kept = record.series("believed")[0] == 1.0
     by_hand = np.trapezoid((od[kept] - 0.5) ** 2, minute[kept])
     assert window["ise"] == pytest.approx(by_hand, rel=1e-3)

@@ -130,7 +130,7 @@ SCHEDULES = Scenario((0.5,), (4.0,), (37.0,)), Scenario((0.8, 0.6), (1.0, 3.0), 
 
 def test_the_summary_has_of_each_reactor_its_own_medium_words_and_windows() -> None:
     """Of five rows and of three; the second step of M1 was not over when the run ended."""
-    found = summary.summarise(two_reactors(), SCHEDULES, ("replicate", "control"), "stopped")
+    found = summary.summarise(two_reactors(), SCHEDULES, ("replicate", "control"), "stopped", Progress(SCHEDULES))
     assert found["reactors"] == {
         "M0": {
             "role": "replicate", "volume_ml": pytest.approx(2.5), "rows": 5, "interlock": 2,
