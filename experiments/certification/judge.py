@@ -10,10 +10,11 @@ from dqn.policy import RELATIVE, Policy
 from experiments.certification.boxes import contradictions, on_lines
 from experiments.certification.config import CertifyConfig, Limits
 from experiments.certification.intervals import Mask, Points, drops, points_in_strips
+from experiments.certification.loops import Loop
 from experiments.certification.network import Array, Network
 from experiments.certification.polygons import Regions, partition
 from experiments.certification.question import Question, actions, question
-from experiments.certification.verdict import Loop, Proof, attacked, dose_below, prove
+from experiments.certification.verdict import Proof, attacked, dose_below, prove
 
 __all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Requirement", "certify", "recheck", "worst"]
 

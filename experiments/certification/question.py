@@ -11,9 +11,8 @@ from dqn.policy import ABSOLUTE, RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
+from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.network import Array
-from experiments.certification.od_loop import OdCase, OdLoop
-from experiments.certification.share_loop import ShareCase, ShareLoop
 
 __all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
 

@@ -2,41 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from dqn.policy import Policy
-from experiments.certification.intervals import Band, Index, Mask, Pieces, Points, States, images
+from experiments.certification.intervals import Band, Index, Mask, Points, images
+from experiments.certification.loops import Loop
 from experiments.certification.network import Array
 
-__all__ = ["Loop", "Proof", "attacked", "dose_below", "prove"]
+__all__ = ["Proof", "attacked", "dose_below", "prove"]
 
 STILL = 1e-9  # smaller changes of the state in a period count as zero
 ATTACKED = 60  # periods of an attacking trajectory
 SETTLED = 20  # of them until the start has no influence
 LESS = (0.0, 0.3)  # probabilities of intermediate disturbances, for each half of the trajectories
 TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities of a change of side, for each quarter of the trajectories
-
-
-class Loop(Protocol):
-    """A family of closed loops with a scalar state, one per strip; cases are disturbances."""
-
-    low: Array
-    high: Array
-
-    @property
-    def growth(self) -> Array: ...
-    def shift(self, case: Any) -> Array: ...
-    def range(self, case: Any) -> Array: ...
-    def seen(self, case: Any) -> tuple[Array, Array]: ...
-    def states(self, case: Any) -> States: ...
-    def law(self, case: Any) -> Pieces: ...
-    def half_width(self, low: Array, high: Array) -> Array: ...
-    def within(self, half_width: Array) -> tuple[Array, Array]: ...
-    def key(self, case: Any) -> object: ...
-    def in_od(self, case: Any, half_width: float) -> float | None: ...
-    def attack(self, case: Any, state: Array, second: Array, push: Array) -> tuple[Array, Array]: ...
 
 
 @dataclass(frozen=True, eq=False)

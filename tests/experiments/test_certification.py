@@ -16,8 +16,8 @@ from experiments.certification.boxes import contradictions, on_lines, possible
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Pieces, drops, images, points_in_strips
 from experiments.certification.judge import SAFETY, _count, _required, _worst, certify, recheck
+from experiments.certification.loops import OdCase, OdLoop
 from experiments.certification.network import Network, q_values, rounding
-from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.polygons import Regions, area, partition
 from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import Proof, attacked, dose_below, physical, prove
