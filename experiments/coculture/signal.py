@@ -14,8 +14,10 @@ from envs.bench import Bench
 from envs.coculture.task import logit
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.coculture.base import Array, Law, Mask, ShareEstimator, Wanted
+from experiments.coculture.base import Array, Mask, Wanted
+from experiments.coculture.laws import Periodic
 from experiments.coculture.program import program_of
+from experiments.coculture.recall import Recall
 from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
@@ -75,8 +77,8 @@ class Decider:
     """What is believed of the share, and what is done about it."""
 
     remembers = ("estimator", "law")
-    estimator: ShareEstimator
-    law: Law
+    estimator: Recall
+    law: Periodic[Any]
 
 
 class Share:
@@ -96,8 +98,8 @@ class Share:
 
     def __init__(
         self,
-        estimator: ShareEstimator,
-        law: Law,
+        estimator: Recall,
+        law: Periodic[Any],
         schedules: Sequence[Scenario],
         warnings: ShareWarnings | None = None,
         simulated: bool = False,
