@@ -15,7 +15,7 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Requirement, recheck, worst
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 

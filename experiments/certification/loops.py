@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.intervals import Pieces, States
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 
 __all__ = ["Loop", "OdCase", "OdLoop", "ShareCase", "ShareLoop"]
 

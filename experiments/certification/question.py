@@ -12,7 +12,7 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 
 __all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from dqn.policy import Policy
 from experiments.certification.intervals import Band, Index, Mask, Points, images
 from experiments.certification.loops import Loop
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 
 __all__ = ["Proof", "attacked", "dose_below", "prove"]
 

@@ -18,7 +18,7 @@ from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Band, Pieces, images
 from experiments.certification.judge import certify, recheck
 from experiments.certification.loops import ShareCase, ShareLoop
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, question
 from tests.experiments import laws, proofs
 
