@@ -80,7 +80,6 @@ class ShareCell(Cell):
 
     @property
     def vials(self) -> tuple[object, ...]:
-        """See `Cell.vials`."""
         return *super().vials, self.density, self.calibrated
 
 
@@ -101,7 +100,6 @@ class ShareTrial(Trial):
     od: Array
 
     def names(self) -> dict[str, Any]:
-        """See `Trial.names`."""
         cell = cast(ShareCell, self.cell)
         beside = {"preview": self.foresight, "density": cell.density, "calibrated": cell.calibrated}
         return super().names() | beside

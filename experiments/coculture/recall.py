@@ -62,7 +62,6 @@ class Recall:
         self._chapters, self._again = [], None
 
     def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
-        """See `CompositionEstimator.calibrate`."""
         self.estimator.calibrate(factor, factor_sd, offset, offset_sd)
 
     @property
@@ -81,7 +80,6 @@ class Recall:
         return self._again is not None
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `CompositionEstimator.watch`."""
         if not rows.any():
             return
         now = float(minute[rows].max())
@@ -100,7 +98,6 @@ class Recall:
         self.earliest = self._chapters[0].then
 
     def dosed(self, volume_ml: Array) -> None:
-        """See `CompositionEstimator.dosed`."""
         if self._chapters:
             self._show(self._last(), "dosed", (np.array(volume_ml),))
         else:
@@ -174,5 +171,4 @@ class Recall:
         return self.estimator.estimate()
 
     def explain(self) -> dict[str, Array]:
-        """See `CompositionEstimator.explain`."""
         return self.estimator.explain()

@@ -214,7 +214,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """Draw paired differences of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval.
 
-    Args: entries: of `statistics.total_pairs`, all of one scenario; against: the controller at zero.
+    Args: entries: of `statistics.pairs` by `total_scores`, all of one scenario; against: the controller at zero.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
     open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")

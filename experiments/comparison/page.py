@@ -123,30 +123,6 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
     )
 
 
-def cell_by_cell(rows: Sequence[Row]) -> Table:
-    """Compare the published value and this run's for each controller, in both conventions, and name the lower one."""
-    body = []
-    for p in TABLE_2:
-        row = _find(rows, controller=p.controller, scenario=p.scenario, window=p.window)
-        if row is None:
-            continue
-        cells = [f"{name_of(p.scenario, p.window)}, {p.controller}"]
-        for metric in METRICS:
-            published, ours = getattr(p, metric), row[f"{metric}_mean"]
-            cells += [f"{number(published, 4)} ({number(published / 30.0)})", f"{number(ours)} ({number(ours / 30.0)})"]
-            cells.append("here" if ours < published else "published")
-        body.append(tuple(cells))
-    columns = ("cell", *(f"{m.upper()}{what}" for m in METRICS for what in (", published", ", here", ", lower")))
-    return Table(
-        "table2_cells",
-        "Table 2 cell by cell: T = 1 min, and in brackets T = window",
-        columns,
-        tuple(body),
-        "T = window: the integrals divided by 30 min. A lower value here means that a simulated culture is held closer "
-        "than the published one, not that the controller is better: plant, pump and start are not the paper's.",
-    )
-
-
 class Loss(NamedTuple):
     """Sentence about a published controller that is lower than the learned policy in a cell of the table."""
 
@@ -298,7 +274,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
 def estimates(out: Page, summary: Row, scenario: str) -> None:
     """Tabulate the uncertainty and coverage of controllers with an estimator on every plant of a scenario."""
     totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
-    for key, title in ESTIMATES if totals else ():
+    for key, title in ESTIMATES:
         note = f"{scenario}; mean, n = {totals[0]['n']}."
         out.table(matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), note))
 
@@ -398,48 +374,6 @@ def _beside_paper(out: Page, summary: Row) -> None:
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
 
 
-def _paper_section(out: Page, summary: Row) -> None:
-    rows = beside(summary)
-    out.section("The paper's Table 2 beside this run")
-    for metric in METRICS:
-        out.table(table_2(rows, metric))
-    out.table(cell_by_cell(rows))
-    if bounded := _below_bound(summary):
-        out.text(bounded)
-
-
-def _below_bound(summary: Row) -> str:
-    """Name published ISE below the oracle's on the training model, if the oracle was run on it."""
-    found = []
-    for p in TABLE_2:
-        if p.scenario != "setpoint_steps":
-            continue
-        row = _find(summary["rows"], controller="oracle", plant="nominal", scenario=p.scenario, window=p.window)
-        if row is not None and p.ise < row["ise_mean"]:
-            found.append(f"{p.controller} at {name_of(p.scenario, p.window)} ({p.ise:g} against {row['ise_mean']:.3f})")
-    if not found:
-        return ""
-    return (
-        "Published ISE below what even the oracle reaches on the nominal model, where the pump limits a step down: "
-        + ", ".join(found)
-        + ". The paper's pump outran its culture's growth by more than the nominal values allow, or its step began "
-        "lower; it reports neither."
-    )
-
-
-def _settings(agents: Mapping[str, Row]) -> Table | None:
-    """Tabulate the hyper-parameters that differ between the agents of this run."""
-    trained = {name: entry["agent"] for name, entry in agents.items() if "agent" in entry}
-    if len(trained) < 2:
-        return None
-    keys = [k for k in next(iter(trained.values())) if len({str(agent[k]) for agent in trained.values()}) > 1]
-    body = tuple((k, *(str(agent[k]).replace("[]", "none") for agent in trained.values())) for k in keys)
-    return Table(
-        "agents", "What tells the agents apart", ("hyper-parameter", *trained), body,
-        "dqn_paper: what the paper states, and what is customary where it says nothing. Everything else is the same.",
-    ) if keys else None  # fmt: skip
-
-
 def _learning_section(out: Page, summary: Row, run: Path) -> None:
     first = [f for f in summary["figures"] if f["file"].startswith(("training/", "figures/fig2a"))]
     if not first and not summary["agents"]:
@@ -452,8 +386,6 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
             for k in ("mu", "tau")
         ]
         out.text(f"Calibration: {', '.join(parts)}; PMSE {number(fitted['pmse_pct'])} %.")
-    if settings := _settings(summary["agents"]):
-        out.table(settings)
     for name, entry in summary["agents"].items():
         regret = entry["regret_pct"]
         shown = ", ".join(number(r) for r in regret) if isinstance(regret, list) else number(regret)
@@ -466,7 +398,9 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
 def _density(out: Page, summary: Row, run: Path) -> None:
     """Add the paper's table, the figures, every plant."""
     if summary["beside_paper"]:
-        _paper_section(out, summary)
+        out.section("The paper's Table 2 beside this run")
+        for metric in METRICS:
+            out.table(table_2(beside(summary), metric))
     regulated = _find(summary["rows"], controller="dqn", scenario="regulation")
     rest = [f for f in summary["figures"] if not f["file"].startswith(("training/", "figures/fig2a"))]
     if rest:

@@ -148,7 +148,6 @@ class Mpc:
         self._rate = np.zeros(n)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         idx = np.flatnonzero(usable(od, rows))
         if idx.size:
             problem = Problem(np.maximum(od[idx], LOWEST_OD), setpoint[idx], self.model, self.config.penalty)
