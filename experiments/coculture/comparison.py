@@ -1,6 +1,6 @@
 """Comparison of controllers of the composition: their closed loops, numbers, figures and page."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -25,7 +25,7 @@ from experiments.coculture.signal import TRUE, Share
 from experiments.comparison import page, run, statistics, studies, trials
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.figures import by_plant, estimate
-from experiments.comparison.page import Row, Section, law_of, matrix, scaled
+from experiments.comparison.page import Measure, Row, Section, law_of, scaled, tables
 from experiments.comparison.statistics import Spread
 from experiments.comparison.studies import Drawing
 from experiments.comparison.trials import Cell, Followed, Trial, closed, record
@@ -50,6 +50,7 @@ FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # laws that act 
 COLUMNS = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
 """Fields of a `ShareTrial` and the columns of a recording that they are."""
 
+ERRORS = {"_mean": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
 SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
 STEP = 5  # minutes between the points of a share's curve
 LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
@@ -293,28 +294,18 @@ def _od(row: Row) -> str:
 
 def _section(out: Page, summary: Row, run: Path) -> None:
     """Add a section of every scenario."""
-    errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
-    for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
+    rows, note = summary["rows"], "n = {n} reactors each."
+    for scenario in dict.fromkeys(str(r["scenario"]) for r in rows):
         out.section(scenario)
-
-        def add(
-            key: str, entries: Sequence[Row], title: str, text: Callable[[Row], str],
-            ranked_by: str | None = None, folded: str = "", scenario: str = scenario,
-        ) -> None:  # fmt: skip
-            entries = [e for e in entries if e["scenario"] == scenario]
-            if entries:
-                note = f"n = {entries[0]['n']} reactors each."
-                table = matrix(f"{scenario}_{key}", title, entries, text, note, ranked_by, laws_down=True)
-                out.table(table, folded=folded and f"{folded}: {scenario}")
-
-        rows = summary["rows"]
-        for ending, when in errors.items():
-            key = f"ratio_abs_error{ending or '_mean'}"
-            known = [r for r in rows if r[key] is not None]
-            add(key, known, f"Mean |r - setpoint|{when}", partial(scaled, key=key), key)
-        add("paired", summary["paired"], "Difference to the vendor's PI", _lower)
-        add("estimate", rows, "Error of the estimate (rms), and how much its band covers", _estimate, folded="Estimate")
-        add("od", rows, "OD: least, mean, largest", _od, folded="OD")
+        add = partial(tables, out, scenario, laws_down=True)
+        for ending, when in ERRORS.items():
+            key = f"ratio_abs_error{ending}"
+            measure = Measure(key, f"Mean |r - setpoint|{when}", partial(scaled, key=key), note, key)
+            add([r for r in rows if r[key] is not None], measure)
+        add(summary["paired"], Measure("paired", "Difference to the vendor's PI", _lower, note))
+        title = "Error of the estimate (rms), and how much its band covers"
+        add(rows, Measure("estimate", title, _estimate, note, folded=True))
+        add(rows, Measure("od", "OD: least, mean, largest", _od, note, folded=True))
         for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
             out.figure(run / f["file"], f["title"], f["caption"])
 

@@ -12,8 +12,8 @@ from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
 __all__ = [
-    "RANKED", "SECTIONS", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "scaled",
-    "table_2",
+    "RANKED", "SECTIONS", "Measure", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses",
+    "scaled", "table_2", "tables",
 ]  # fmt: skip
 
 Row = Mapping[str, Any]
@@ -45,12 +45,6 @@ DENSITY = {
     "comparisons.",
     "±": "one standard deviation over replicates.",
 }
-ESTIMATES = (
-    ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
-    ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
-    ("supervised_pct", "Decisions by the supervisor's controller, %"),
-    ("alarm_pct", "Of these, because of innovations, %"),
-)
 RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
 """Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
 OUT_OF_COMPETITION = ("oracle", "optimum")
@@ -222,41 +216,32 @@ def _percent(pair: Row) -> str:
     return f"{pair['percent']:+.1f} [{scale * low:+.1f}, {scale * high:+.1f}]"
 
 
-def every_plant(out: Page, summary: Row, scenario: str) -> None:
-    """Tables of one scenario on every plant."""
-    totals = [e for e in summary["totals"] if e["scenario"] == scenario]
-    pairs = [e for e in summary["paired_totals"] if e["scenario"] == scenario]
-    n = totals[0]["n"]
-    out.add("subheading", text=scenario)
-    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²")):
-        table = matrix(
-            f"{scenario}_{metric}",
-            f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
-            totals,
-            partial(_mean_sd, metric=metric, scale=scale),
-            f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
-            ranked_by=f"{metric}_mean",
-            floor=partial(scaled, key=f"floor_{metric}", scale=scale),
-        )
-        out.table(table)
-    for against, heading in (
-        ("oracle", "Distance from the oracle"),
-        ("dqn", "Paired difference to the learned policy"),
-        ("dqn_adaptive", "Paired difference to the adaptive policy"),
-    ):
-        for metric in METRICS:
-            chosen = [p for p in pairs if p["against"] == against and p["metric"] == metric]
-            if chosen:
-                table = matrix(
-                    f"{scenario}_{metric}_vs_{against}",
-                    f"{heading}, {metric.upper()}, %",
-                    chosen,
-                    _percent,
-                    f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {n}. Where "
-                    f"{against}'s mean is 0 the difference itself.",
-                )
-                out.table(table, folded=f"{heading}, {metric.upper()}: {scenario}")
-    extra = (
+class Measure(NamedTuple):
+    """A table of every law on every plant of a scenario. note: {n} is the number of replicates."""
+
+    key: str
+    title: str
+    text: Callable[[Row], str]
+    note: str
+    ranked_by: str | None = None
+    floor: Callable[[Row], str] | None = None
+    folded: bool = False
+
+
+SCORES = [
+    Measure(
+        metric,
+        f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
+        partial(_mean_sd, metric=metric, scale=scale),
+        "Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
+        f"{metric}_mean",
+        partial(scaled, key=f"floor_{metric}", scale=scale),
+    )
+    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²"))
+]
+FURTHER = [
+    Measure(key, title, partial(scaled, key=key), "Mean, n = {n}.", key if ranked else None, folded=True)
+    for key, title, ranked in (
         ("itae_median", "ITAE of the measured OD (OD min²), sum over the windows, median over vials", True),
         ("clean_ise", "ISE of the noise-free OD (OD² min), sum over the windows", True),
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
@@ -265,18 +250,48 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ("media_ml", "Fresh medium used (mL per vial)", False),
         ("held", "Samples on which the interlock allowed no dose, per vial", False),
     )
-    for key, title, ranked in extra:
-        ranking = key if ranked else None
-        table = matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), f"Mean, n = {n}.", ranking)
-        out.table(table, folded=f"{title}: {scenario}")
+]
+ESTIMATES = [
+    Measure(key, title, partial(scaled, key=key), "{scenario}; mean, n = {n}.")
+    for key, title in (
+        ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
+        ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
+        ("supervised_pct", "Decisions by the supervisor's controller, %"),
+        ("alarm_pct", "Of these, because of innovations, %"),
+    )
+]
+
+
+def tables(out: Page, scenario: str, entries: Sequence[Row], *measures: Measure, laws_down: bool = False) -> None:
+    """Add the tables of one scenario, where there are entries."""
+    known = [e for e in entries if e["scenario"] == scenario]
+    for m in measures if known else ():
+        note = m.note.format(n=known[0]["n"], scenario=scenario)
+        table = matrix(f"{scenario}_{m.key}", m.title, known, m.text, note, m.ranked_by, m.floor, laws_down)
+        out.table(table, folded=f"{m.title}: {scenario}" if m.folded else "")
+
+
+def every_plant(out: Page, summary: Row, scenario: str) -> None:
+    """Tables of one scenario on every plant."""
+    out.add("subheading", text=scenario)
+    tables(out, scenario, summary["totals"], *SCORES)
+    for against, heading in (
+        ("oracle", "Distance from the oracle"),
+        ("dqn", "Paired difference to the learned policy"),
+        ("dqn_adaptive", "Paired difference to the adaptive policy"),
+    ):
+        for metric in METRICS:
+            chosen = [p for p in summary["paired_totals"] if p["against"] == against and p["metric"] == metric]
+            note = f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {{n}}. Where "
+            note += f"{against}'s mean is 0 the difference itself."
+            title = f"{heading}, {metric.upper()}, %"
+            tables(out, scenario, chosen, Measure(f"{metric}_vs_{against}", title, _percent, note, folded=True))
+    tables(out, scenario, summary["totals"], *FURTHER)
 
 
 def estimates(out: Page, summary: Row, scenario: str) -> None:
     """Tabulate the uncertainty and coverage of controllers with an estimator on every plant of a scenario."""
-    totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
-    for key, title in ESTIMATES:
-        note = f"{scenario}; mean, n = {totals[0]['n']}."
-        out.table(matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), note))
+    tables(out, scenario, [e for e in summary["totals"] if ESTIMATES[0].key in e], *ESTIMATES)
 
 
 def all_rows(summary: Row) -> Table:
@@ -425,7 +440,7 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
-    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0][0] in e)
+    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0].key in e)
     if estimated:
         out.section("How sure the estimates were, and what the supervisor did")
         for scenario in estimated:

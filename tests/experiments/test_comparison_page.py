@@ -179,7 +179,14 @@ def test_differences_to_each_law_stand_in_a_table_of_their_own_by_metric() -> No
             for i, plant in enumerate(("nominal", "bench")):
                 percent = 10.0 * k + 3.0 * j + i + 1.0
                 low, high = percent / 200.0, percent / 50.0
-                at = {"scenario": "day", "plant": plant, "controller": "pi", "against": against, "metric": metric}
+                at = {
+                    "scenario": "day",
+                    "plant": plant,
+                    "controller": "pi",
+                    "against": against,
+                    "metric": metric,
+                    "n": 4,
+                }
                 pairs.append({**at, "percent": percent, "difference": percent / 100.0, "ci95": [low, high]})
     pairs[-1] |= {"percent": None, "difference": 0.75}
     out = section()
