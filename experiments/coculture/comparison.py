@@ -161,20 +161,15 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
 
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
     """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
-    found: dict[str, Followed | None] = {}
+    found, two = dict[str, Followed | None](), of_benchmark(config)
     for name in names:
         kept = folder / "policies" / name
         kept.mkdir(parents=True, exist_ok=True)
-        where = of_benchmark(config).composition_policies.get(name, "shipped")
-        policy = composition_policy(of_benchmark(config).compositions[name].kind, where, kept, resumed=False)
+        where = two.composition_policies.get(name, "shipped")
+        policy = composition_policy(two.compositions[name].kind, where, kept, resumed=False)
         if policy is not None:
             try:
-                registry.build(
-                    of_benchmark(config).compositions[name],
-                    SHARE,
-                    policy=policy,
-                    pair=read_pair(of_benchmark(config).pair),
-                )
+                registry.build(two.compositions[name], SHARE, policy=policy, pair=read_pair(two.pair))
             except ValueError as error:
                 remedy = f"give composition_policies.{name}=RUN, or studies.NAME.compositions without {name}"
                 raise frame.UserError(f"{error}; {remedy}") from None
@@ -182,9 +177,9 @@ def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> 
     return found
 
 
-def abs_error(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| wherever a share is asked for, (N,)."""
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint), axis=1))
+def abs_error(trial: ShareTrial, since: int = 0) -> Array:
+    """Mean |r - setpoint| from a minute on wherever a share is asked for, (N,)."""
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, since:], axis=1))
 
 
 def last_hours(trial: ShareTrial) -> Array:
@@ -200,16 +195,9 @@ def last_hours(trial: ShareTrial) -> Array:
     return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
 
 
-def _last_day(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| of the last day of a run of two days or more, else nan, (N,)."""
-    if trial.minute[-1] < 2 * DAY_MIN:
-        return np.full(len(trial.share), np.nan)
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, -DAY_MIN:], axis=1))
-
-
 def share_row(trial: ShareTrial) -> dict[str, Any]:
     """Build the row of a share in summary.json, judged by the true share."""
-    error = Spread(abs_error(trial))
+    error, days = Spread(abs_error(trial)), trial.minute[-1] >= 2 * DAY_MIN
     inside = (trial.low <= trial.share) & (trial.share <= trial.high)
     return trial.names() | {
         "n": error.n,
@@ -217,7 +205,7 @@ def share_row(trial: ShareTrial) -> dict[str, Any]:
         "ratio_abs_error_sd": error.sd,
         "ci95": error.ci95,
         "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
-        "ratio_abs_error_last_day": Spread(_last_day(trial)).mean,
+        "ratio_abs_error_last_day": Spread(abs_error(trial, -DAY_MIN)).mean if days else float("nan"),
         "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
         "band_covers": float(inside.mean()),
         "od_min": float(trial.od.min()),

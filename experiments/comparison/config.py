@@ -62,17 +62,11 @@ class BenchmarkConfig:
                 known = [*getattr(self, key)]
                 if key == "plants":
                     known += [TWIN if self.plant_file else f"{TWIN} (with plant_file=FILE)"]
-                for given in getattr(study, key):
-                    if given not in known:
-                        raise ValueError(f"studies.{name}.{key}: {given} is none of {', '.join(known)}")
+                wrong = next((given for given in getattr(study, key) if given not in known), None)
+                require(wrong is None, f"studies.{name}.{key}", wrong, ", ".join(known))
         for name, scenario in self.scenarios.items():
-            timed = not any((*scenario.until, *scenario.outputs))
-            require(
-                timed,
-                f"scenarios.{name}",
-                scenario.until or scenario.outputs,
-                "no until and no outputs in a comparison",
-            )
+            given = *scenario.until, *scenario.outputs
+            require(not any(given), f"scenarios.{name}", given, "no until and no outputs in a comparison")
         met = any(TWIN in study.plants for study in self.studies.values())
         wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
         require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)
