@@ -26,7 +26,7 @@ class Proof:
 
     holdable: without a dose the culture grows, with the full pump it is diluted, under any disturbance.
     band, law: of the policy, and of the one-line controller. half_width, law_half_width: of the bands.
-    margin: allowed half-width beyond the controller's. allowed: [lowest, highest] state of that half-width, (S, 2).
+    allowed: [lowest, highest] state of a half-width that exceeds the controller's by what is allowed, (S, 2).
     entry: periods until the state is allowed, over those of the physics; inf: never.
     grows: below the range of starts every possible dose lets it grow.
     """
@@ -37,7 +37,6 @@ class Proof:
     law: Band
     half_width: Array
     law_half_width: Array
-    margin: float
     allowed: Array
     entry: Array
     grows: Mask
@@ -49,7 +48,7 @@ class Proof:
 
     @property
     def later(self) -> Array:
-        """Periods after the one-line controller until within its half-width plus `margin`, (S,); inf: never."""
+        """Periods after the one-line controller until within `allowed`, (S,); inf: never."""
         of_policy, of_law = (band.until(*self.allowed.T) for band in (self.band, self.law))
         return of_policy - np.where(np.isfinite(of_law), of_law, 0.0)
 
@@ -85,7 +84,6 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
         law,
         loop.half_width(band.low, band.high),
         law_half_width,
-        margin,
         allowed,
         band.until(*allowed.T) / physical(start, shift, allowed),
         np.asarray((~below | (own > 0.0)).all(axis=1)),

@@ -257,7 +257,7 @@ def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() ->
     every, law, policy = np.ones(3, dtype=bool), np.array([0.1, 0.2, 0.3]), np.array([0.125, 0.1875, 0.75])
     untils = [Mock(return_value=np.array(periods)) for periods in ([5.0, 7.0, np.inf], [3.0, np.inf, 2.0])]
     ends, bands = np.array([[-0.6, 0.6], [-0.7, 0.7], [-0.8, 0.8]]), (SimpleNamespace(until=each) for each in untils)
-    proof = Proof(None, every, *bands, policy, law, 0.5, ends, np.ones(3), every)
+    proof = Proof(None, every, *bands, policy, law, ends, np.ones(3), every)
     assert proof.later.tolist() == [2.0, 7.0, np.inf]
     for until in untils:
         np.testing.assert_allclose(until.call_args.args, ends.T)
