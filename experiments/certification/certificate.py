@@ -65,7 +65,6 @@ def _up(value: Array, digits: float = 1e6) -> Array:
 
 
 def _case(proof: Proof) -> dict[str, Any]:
-    """One case as columns over the strips."""
     return {
         **asdict(proof.case),
         "holdable": proof.holdable,

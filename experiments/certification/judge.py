@@ -83,17 +83,14 @@ class Certificate:
     quick: bool
 
     def failed(self, kind: str) -> list[Requirement]:
-        """Return the requirements of a kind that are not met."""
         return [check for check in self.checks if check.kind == kind and not check.holds]
 
     @property
     def safe(self) -> bool:
-        """Whether every requirement of safety is met."""
         return not self.failed(SAFETY)
 
     @property
     def passed(self) -> bool:
-        """Whether every requirement is met."""
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
@@ -125,7 +122,6 @@ class Certificate:
 
 
 def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, float]]:
-    """Return stretches of neighbouring strips."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]])))
     for first, last in edges.reshape(-1, 2):
         yield float(loop.low[first]), float(loop.high[last - 1])

@@ -120,7 +120,6 @@ class OdLoop(Loop):
         return np.full(self.low.size, self.mu * self.control_min)
 
     def at(self, setpoints: Array) -> "OdLoop":
-        """Return the same loop for single setpoints in place of strips."""
         return replace(self, low=setpoints, high=setpoints)
 
     def shift(self, case: OdCase) -> Array:

@@ -32,7 +32,6 @@ class Network:
 
     @classmethod
     def of(cls, policy: Policy) -> "Network":
-        """Read the network of a policy."""
         weights = (policy.input_matrix.T, *policy.weights)
         biases = (policy.input_offset, *policy.biases)
         return cls(*(tuple(np.asarray(a, dtype=np.float64) for a in arrays) for arrays in (weights, biases)))

@@ -101,7 +101,6 @@ def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
 
 
 def _of_od(policy: Policy, config: CertifyConfig) -> Question:
-    """Build the question of a policy from (OD, setpoint) to a pump rate."""
     model, limits = model_of(policy, config), config.limits
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))

@@ -34,7 +34,6 @@ class ShareEstimate:
     thermometer: Array
 
     def of(self, idx: NDArray[np.intp]) -> "ShareEstimate":
-        """Return the estimate of some of the cultures."""
         return ShareEstimate(*(getattr(self, f.name)[idx] for f in fields(self)))
 
     @property

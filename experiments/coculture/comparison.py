@@ -281,7 +281,6 @@ def _od(row: Row) -> str:
 
 
 def _section(out: Page, summary: Row, run: Path) -> None:
-    """Add a section of every scenario."""
     rows, note = summary["rows"], "n = {n} reactors each."
     for scenario in dict.fromkeys(str(r["scenario"]) for r in rows):
         out.section(scenario)

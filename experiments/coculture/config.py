@@ -114,17 +114,14 @@ class OfBenchmark:
 
 
 def of_study(study: StudyConfig) -> OfStudy:
-    """Return a study as what two species are told by."""
     return cast(OfStudy, study)
 
 
 def of_benchmark(config: BenchmarkConfig) -> OfBenchmark:
-    """Return a benchmark's config as what two species are told by."""
     return cast(OfBenchmark, config)
 
 
 def of_deploy(config: DeployConfig) -> OfDeploy:
-    """Return a deployment's config as what two species are told by."""
     return cast(OfDeploy, config)
 
 

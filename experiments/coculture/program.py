@@ -56,7 +56,6 @@ class Ratios:
 
 
 def ratios_of(scenario: Scenario) -> Ratios:
-    """Return a scenario as what asks for a share."""
     return cast(Ratios, scenario)
 
 
@@ -72,7 +71,6 @@ def resting(scenario: Scenario, even_c: float) -> Scenario:
 
 
 def program_of(scenario: Scenario) -> "Program":
-    """Return the program of the share in a schedule."""
     asked = ratios_of(scenario)
     if asked.ratio_sine:
         mean, amplitude, period = asked.ratio_sine

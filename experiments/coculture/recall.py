@@ -53,7 +53,6 @@ class Recall:
         self._again: Again | None = None
 
     def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
         self.estimator.reset(n)
         self._forget()
         self.earliest = copy.deepcopy(self.estimator)
@@ -66,7 +65,6 @@ class Recall:
 
     @property
     def begun(self) -> Mask:
-        """Which cultures have been seen."""
         return self.estimator.begun
 
     @property
@@ -76,7 +74,6 @@ class Recall:
 
     @property
     def behind(self) -> bool:
-        """Whether samples are on their way into the estimate."""
         return self._again is not None
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
@@ -167,7 +164,6 @@ class Recall:
                 self._chapters[again.chapter].then = copy.deepcopy(again.estimator)
 
     def estimate(self) -> ShareEstimate:
-        """Return the current estimate."""
         return self.estimator.estimate()
 
     def explain(self) -> dict[str, Array]:

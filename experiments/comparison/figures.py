@@ -42,12 +42,10 @@ MARKS = {
 
 
 def _mark(controller: str) -> tuple[str, str]:
-    """Return colour and marker of a controller."""
     return MARKS.get(controller, (COLOURS[0], "X"))
 
 
 def _handles(controllers: Sequence[str]) -> list[Line2D]:
-    """Return the entries of a legend."""
     return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
 
 

@@ -77,7 +77,6 @@ def _mark(text: str, best: bool) -> str:
 
 
 def beside(summary: Row) -> list[Row]:
-    """List the rows beside the paper's table."""
     keys = ("controller", "plant", "scenario", "window")
     chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
     return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
@@ -461,7 +460,6 @@ SECTIONS = {
 
 
 def of_benchmark(run: Path) -> Page:
-    """Build the page of a benchmark's run folder."""
     guests.load("experiments.comparison")
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]

@@ -103,7 +103,6 @@ def _detail(trial: DensityTrial, window: Window) -> dict[str, Any]:
 
 
 def _total(trial: DensityTrial, metric: str, of: str = "measured") -> Array:
-    """Sum a metric over the windows of a trial, (N,)."""
     each = [getattr(trial.score(window, of), metric) for window in windows(trial.schedule)]
     return np.asarray(np.sum(each, axis=0))
 
@@ -178,5 +177,4 @@ def pairs(trials: Sequence[Trial], against: str, scores: Callable[[Any], Scored]
 
 
 def total_scores(trial: DensityTrial) -> Scored:
-    """Return the sums over windows."""
     return [("all", metric, _total(trial, metric)) for metric in METRICS]

@@ -248,7 +248,6 @@ Followed = tuple[Policy, EstimateBounds | None]
 
 
 def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
-    """Run a trial of a density controller behind an interlock."""
     policy, bounds = followed or (None, None)
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
