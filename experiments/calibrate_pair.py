@@ -18,7 +18,7 @@ from envs.identification.curves import Plateau, Polynomial
 from envs.identification.screening import Series
 from experiments.cli import files, frame
 from experiments.coculture.estimator import CompositionEstimator, CompositionEstimatorConfig
-from experiments.recordings.reader import Recording, read_recording
+from experiments.recordings.reader import read_recording
 from hardware.errors import RecordingError
 from hardware.storage.atomic import write
 from hardware.storage.marks import read_marks
@@ -63,17 +63,13 @@ class CalibratePairConfig:
         require(0.0 <= first <= second <= 600.0, "lags_min", self.lags_min, "two of 0 to 600 min, the first not longer")
 
 
-def _read(path: str, pump_ml_s: float) -> Recording:
-    with frame.refusing(ValueError, RecordingError):
-        return read_recording(path, pump_ml_s=pump_ml_s)
-
-
 def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfig) -> list[Plateau]:
     """Of all recordings of a species, in order of temperature. Raises: UserError for one without temperatures."""
     settle_min = max(config.settle_min, LAGS * lag_min)
     found: list[Plateau] = []
     for path in paths:
-        r = _read(path, config.pump_ml_s)
+        with frame.refusing(ValueError, RecordingError):
+            r = read_recording(path, pump_ml_s=config.pump_ml_s)
         if not np.isfinite(r.temperature).any():
             raise frame.UserError(f"{path}: no temperature in it; give a recording with a column temperature_degc")
         low, high = np.nanmin(r.temperature), np.nanmax(r.temperature)
@@ -113,22 +109,20 @@ def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfi
 
     Raises: UserError where no recording of the second species has light.
     """
-    lit = [p for p in points if p.light is not None]
+    lit = [(p, p.light.value) for p in points if p.light is not None]
     if not lit:
         where = ", ".join(config.second)
         raise frame.UserError(f"second={where}: no light in it; record with backend.fluorescence, which measures it")
-    if dark := [p for p in lit if p.light is not None and p.light.value <= 0.0]:
+    if dark := [p for p, light in lit if light <= 0.0]:
         at = f"second: light at {dark[0].temperature:.1f} degC is no more than offset={config.offset:g} counts"
         raise frame.UserError(
             f"{at}; are these recordings of the second species, and is that the offset of this sensor?"
         )
-    t = np.array([p.temperature for p in lit])
-    glow = np.array([p.light.value for p in lit if p.light is not None]) / config.factor - config.od_term
-    made = np.maximum(glow, 0.0) * np.array([p.growth.value for p in lit])
-    usual = PigmentConfig()
+    t, growth, light = np.array([(p.temperature, p.growth.value, light) for p, light in lit]).T
+    made = np.maximum(light / config.factor - config.od_term, 0.0) * growth
     degree, centre = min(4, np.unique(np.round(t)).size - 1), float(np.round(t.mean(), 1))
     found = curves.fit(t, made, np.maximum(0.03 * made, 30.0), degree, centre)
-    return replace(usual, polynomial=found.coefficients, centre_c=centre)
+    return PigmentConfig(found.coefficients, centre)
 
 
 def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfig, dict[str, float]]:
@@ -139,12 +133,11 @@ def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfi
     """
     assert config.mixed is not None
     path = Path(config.mixed)
-    r, name = _read(config.mixed, config.pump_ml_s), path.stem
-    with frame.refusing(RecordingError):
-        every = read_marks(path.parent.parent)
+    name, run = path.stem, path.parent.parent
+    with frame.refusing(ValueError, RecordingError):
+        r, every = read_recording(config.mixed, pump_ml_s=config.pump_ml_s), read_marks(run)
     marks = [m for m in every if m.reactor == name and m.share is not None and m.sd is not None]
     if not marks:
-        run = path.parent.parent
         how = f"python -m experiments.mark run={run} reactor={name} share=SHARE sd=SD minute=MINUTE"
         raise frame.UserError(f"mixed={path}: no marked share for {name} in {run}; mark some: {how}")
     guess = CompositionEstimatorConfig(  # the curves are those of this bench: of its thermometer, and of its pump
@@ -160,18 +153,14 @@ def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfi
             estimator.sample(np.array([m.share]), np.array([m.sd]), yes)
         if k + 1 < len(r.time_min):
             estimator.dosed(np.array([r.pump_rate[k] * 60.0 * (r.time_min[k + 1] - minute)]))
-    off, sd = estimator.growth_errors()
-    scaled = [
-        replace(s, polynomial=tuple(c * (1.0 + float(e)) for c in s.polynomial))
-        for s, e in zip((pair.first, pair.second), off[0], strict=True)
-    ]
-    told = {
-        "first": float(off[0, 0]),
-        "first_sd": float(sd[0, 0]),
-        "second": float(off[0, 1]),
-        "second_sd": float(sd[0, 1]),
-    }
-    return replace(pair, first=scaled[0], second=scaled[1]), told
+    (off,), (sd,) = (errors.tolist() for errors in estimator.growth_errors())
+    first, second = (
+        replace(s, polynomial=tuple(c * (1.0 + e) for c in s.polynomial))
+        for s, e in zip((pair.first, pair.second), off, strict=True)
+    )
+    return replace(pair, first=first, second=second), {
+        "first": off[0], "first_sd": sd[0], "second": off[1], "second_sd": sd[1], "even_c_alone": pair.even_c,
+    }  # fmt: skip
 
 
 def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
@@ -194,11 +183,9 @@ def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
             SpeciesConfig(name, curve.coefficients, (), lag)
             for name, curve, lag in zip(config.names, found, lags, strict=True)
         ]
-        pair = alone = PairConfig(species[0], species[1], _pigment(points[1], config), span)
-        told = None
+        pair, told = PairConfig(species[0], species[1], _pigment(points[1], config), span), None
         if config.mixed is not None:
-            pair, told = _corrected(alone, config)
-            told["even_c_alone"] = alone.even_c
+            pair, told = _corrected(pair, config)
     head = "# Two species, written by calibrate_pair; for pair=FILE of train, deploy and benchmark.\n"
     plain = yaml.safe_dump(files.plain(asdict(pair)), sort_keys=False, allow_unicode=True)
     write(folder / "pair.yaml", head + plain)

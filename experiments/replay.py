@@ -3,15 +3,16 @@
 import logging
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from conf.schema import part, setting
 from envs.bench import Bench
-from envs.identification.calibration import calibrate
+from envs.identification.calibration import IdentifyConfig, calibrate
 from envs.identification.screening import Series, merged
 from envs.identification.twin import twin
 from envs.plant.plant import Plant
@@ -23,10 +24,12 @@ from experiments.cli.calibrated import read_env_file
 from experiments.control.policies import bounds_of, find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Array, Controller
+from experiments.laws.density.learned import LearnedConfig
 from experiments.loop.loop import ClosedLoop
-from experiments.replays.config import ReplayConfig
+from experiments.recordings.config import Source
 from experiments.replays.replay import AHEAD, Replayed, replay
 from hardware.errors import RecordingError
+from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.watched import WatchedInterlock
@@ -35,6 +38,21 @@ log = logging.getLogger(__name__)
 
 SLOWEST_MIN = 0.5  # readings that come faster are merged to minutes
 DAY_MIN, RISE_MIN = 1440.0, 120.0  # of the loop on the twin: its length, and the time after which its error counts
+
+
+@dataclass(frozen=True)
+class ReplayConfig(Source):
+    """A recording, and the controller, the estimator and the interlock that go through it."""
+
+    controller: Any = part(LearnedConfig, "what decides the pump rate", registry.config_at)
+    policy: str = setting("shipped", "of controller=dqn: `shipped`, a policy.npz, a run folder, or `latest`")
+    setpoint: float | None = setting(
+        None, "OD that is asked for; null: the median at which the device dosed", "OD", within=(0.02, 1.5)
+    )
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose growth model the controller is given")
+    bench: Bench = part(Bench, "volume of the vial and largest feed rate; the period is that of the readings")
+    safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
+    identify: IdentifyConfig = part(IdentifyConfig, "how the recording's twin is found, on which the loop is closed")
 
 
 def body(config: ReplayConfig, folder: Path) -> None:

@@ -23,12 +23,7 @@ Array = NDArray[np.float64]
 STEPS = 71  # of temperatures between which crossings are sought
 PLAUSIBLE = (0.02, 10.0)  # 1/h, of the fastest growth; a rate per minute is not
 FILE = "pair.yaml"
-NEEDED = (
-    "first",
-    "second",
-    "pigment",
-    "temperatures",
-)  # of a file: nothing of another pair stands in for what it lacks
+NEEDED = ("first", "second", "pigment", "temperatures")  # of a file: nothing of another pair stands in for one
 
 
 @dataclass(frozen=True)
@@ -97,8 +92,7 @@ class PigmentConfig:
         return np.maximum(np.polyval(np.array(self.polynomial), temperature - self.centre_c), self.least)
 
 
-def _p_putida() -> SpeciesConfig:
-    return SpeciesConfig("P. putida", (-0.02208, 1.3796, -20.56996), (), 60.0)
+P_PUTIDA = SpeciesConfig("P. putida", (-0.02208, 1.3796, -20.56996), (), 60.0)
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,7 @@ class PairConfig:
     """Two species, of which the second makes the pigment. Raises: ValueError naming key, value and what is allowed."""
 
     first: SpeciesConfig = part(SpeciesConfig, "the one without pigment")
-    second: SpeciesConfig = part(_p_putida, "the one whose share is held")
+    second: SpeciesConfig = part(lambda: P_PUTIDA, "the one whose share is held")
     pigment: PigmentConfig = part(PigmentConfig, "of the second")
     temperatures: tuple[float, float] = setting(
         (29.0, 36.0), "range in which the curves hold; beyond it those of the nearer end", "degC", within=(4, 60),

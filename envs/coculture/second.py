@@ -56,7 +56,6 @@ class OfPlant:
 
 
 def of_plant(config: PlantConfig) -> OfPlant:
-    """Return a plant's config as what two species are told by."""
     return cast(OfPlant, config)
 
 

@@ -15,7 +15,7 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Requirement, recheck, worst
-from experiments.certification.network import Array
+from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 
@@ -65,7 +65,6 @@ def _up(value: Array, digits: float = 1e6) -> Array:
 
 
 def _case(proof: Proof) -> dict[str, Any]:
-    """One case as columns over the strips."""
     return {
         **asdict(proof.case),
         "holdable": proof.holdable,
@@ -257,7 +256,7 @@ def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
     """Return missing performance, and performance limits that are wider than the default."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
-    if laxer := stored.config.laxer_performance():
+    if laxer := stored.config.laxer_limits(safety=False):
         lines.append(f"its certificate sets wider limits of performance: {'; '.join(laxer)}")
     return lines
 

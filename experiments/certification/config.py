@@ -145,13 +145,9 @@ class CertifyConfig:
         for name in ("start_od", "growth_shares"):
             own, by = getattr(self, name), getattr(usual, name)
             named += [(name, list(own), list(by))] if own[0] > by[0] or own[1] < by[1] else []
-        return [f"{name} = {own}, by itself {by}" for name, own, by in named] + self._limits(safety=True)
+        return [f"{name} = {own}, by itself {by}" for name, own, by in named] + self.laxer_limits(safety=True)
 
-    def laxer_performance(self) -> list[str]:
-        """Return every performance limit that is less strict than the default."""
-        return self._limits(safety=False)
-
-    def _limits(self, safety: bool) -> list[str]:
+    def laxer_limits(self, safety: bool) -> list[str]:
         """Return the limits of one kind that are less strict than the default. Only `reached` are lower limits."""
         found = []
         for name in (f.name for f in fields(Limits) if f.name.startswith("safe_") is safety):

@@ -43,7 +43,6 @@ def figure(found: Certificate) -> Figure:
 
 
 def _polygons(ax: Axes, found: Certificate) -> None:
-    """Draw the exact regions of the actions."""
     regions = found.regions
     first = np.unique(regions.owner, return_index=True)[1]
     corners = np.split(regions.edges[:, 0], first[1:])

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.certification.network import Array
-from experiments.certification.polygons import Regions
+from experiments.certification.polygons import Array, Regions
 
 __all__ = ["Band", "Index", "Mask", "Pieces", "Points", "States", "crossings", "drops", "images", "points_in_strips"]
 

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from dqn.policy import RELATIVE, Policy
-from experiments.certification.boxes import contradictions, on_lines
 from experiments.certification.config import CertifyConfig, Limits
-from experiments.certification.intervals import Mask, Points, drops, points_in_strips
-from experiments.certification.network import Array, Network
-from experiments.certification.polygons import Regions, partition
+from experiments.certification.intervals import Mask, drops, points_in_strips
+from experiments.certification.loops import Loop
+from experiments.certification.polygons import Array, Network, Regions, contradictions, partition
 from experiments.certification.question import Question, actions, question
-from experiments.certification.verdict import Loop, Proof, attacked, dose_below, prove
+from experiments.certification.verdict import Proof, attacked, dose_below, prove
 
 __all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Requirement", "certify", "recheck", "worst"]
 
@@ -84,17 +83,14 @@ class Certificate:
     quick: bool
 
     def failed(self, kind: str) -> list[Requirement]:
-        """Return the requirements of a kind that are not met."""
         return [check for check in self.checks if check.kind == kind and not check.holds]
 
     @property
     def safe(self) -> bool:
-        """Whether every requirement of safety is met."""
         return not self.failed(SAFETY)
 
     @property
     def passed(self) -> bool:
-        """Whether every requirement is met."""
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
@@ -126,7 +122,6 @@ class Certificate:
 
 
 def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, float]]:
-    """Return stretches of neighbouring strips."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]])))
     for first, last in edges.reshape(-1, 2):
         yield float(loop.low[first]), float(loop.high[last - 1])
@@ -134,23 +129,35 @@ def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, floa
 
 def certify(policy: Policy, config: CertifyConfig) -> Certificate:
     """Certify a policy. Raises: CertificationError if the policy is of no known kind."""
-    asked, network = question(policy, config), Network.of(policy)
+    asked, network, levels = question(policy, config), Network.of(policy), (1, 2, _half(policy))
     exact, wider = partition(network, asked.box)
-
-    def points(case: Any) -> Points:
-        return points_in_strips(wider, *asked.loop.seen(case))
-
-    proofs = tuple(
-        prove(asked.loop, points(case), wider.action, case, asked.margins[case.name]) for case in asked.cases
-    )
-    levels = (1, 2, _half(policy))
-    doses = dose_below(asked.loop, points(asked.cases[0]), wider.action, asked.cases[0], levels)
+    proofs, doses = _proven(asked, wider, levels)
     checks = (
         Requirement("polygons that the bounds of boxes contradict", contradictions(network, exact, GRID), 0),
         *_required(asked, proofs, doses[-1], config.limits),
         *_attacks(policy, asked, proofs, config.trajectories),
     )
     return Certificate(asked, proofs, checks, levels, doses, drops(exact), exact, config.quick)
+
+
+def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
+    """List the requirements that a policy fails at single setpoints, without an attack on its bands."""
+    asked = question(policy, config, setpoints)
+    if policy.observation != RELATIVE:
+        lines = np.clip(np.asarray(setpoints, dtype=np.float64), *asked.setpoints)
+        asked = replace(asked, loop=asked.loop.at(lines), median=None)
+    proofs, doses = _proven(asked, partition(Network.of(policy), asked.box)[1], (_half(policy),))
+    return [check for check in _required(asked, proofs, doses[0], config.limits) if not check.holds]
+
+
+def _proven(asked: Question, wider: Regions, levels: Sequence[int]) -> tuple[tuple[Proof, ...], Array]:
+    """Prove every case; return also how far below the setpoint each of some actions may be given, nominal, (L, S)."""
+    met = [points_in_strips(wider, *asked.loop.seen(case)) for case in asked.cases]
+    proofs = tuple(
+        prove(asked.loop, points, wider.action, case, asked.margins[case.name])
+        for case, points in zip(asked.cases, met, strict=True)
+    )
+    return proofs, dose_below(asked.loop, met[0], wider.action, asked.cases[0], levels)
 
 
 def _half(policy: Policy) -> int:
@@ -232,22 +239,3 @@ def _strip(asked: Question, at: int) -> str:
 
 def _place(asked: Question, low: float, high: float) -> str:
     return f"{asked.what} {low:.4g}" + (f" to {high:.4g}" if high > low else "")
-
-
-def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
-    """List the requirements that a policy fails at single setpoints, without an attack on its bands.
-
-    For a policy of the OD along lines, an independent computation without polygons.
-    """
-    asked, network = question(policy, config, setpoints), Network.of(policy)
-    if policy.observation == RELATIVE:
-        wider = partition(network, asked.box)[1]
-        met = {c.name: points_in_strips(wider, *asked.loop.seen(c)) for c in asked.cases}
-        points, action = met["nominal"], wider.action
-    else:
-        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)), median=None)
-        points, action = on_lines(network, asked.box[0], asked.loop.low)
-        met = dict.fromkeys((case.name for case in asked.cases), points)
-    proofs = [prove(asked.loop, met[c.name], action, c, asked.margins[c.name]) for c in asked.cases]
-    dose = dose_below(asked.loop, points, action, asked.cases[0], (_half(policy),))[0]
-    return [check for check in _required(asked, proofs, dose, config.limits) if not check.holds]

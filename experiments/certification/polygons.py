@@ -1,4 +1,7 @@
-"""Exact convex polygons of the plane on which one action is best."""
+"""Exact convex polygons of the plane on which a policy prefers one action, and an independent check of them.
+
+A policy is a piecewise linear map of the plane, taken in double precision, with a bound for single precision.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,11 +9,70 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.certification.network import Array, Network, rounding
+from dqn.policy import Policy
 
-__all__ = ["Regions", "area", "partition"]
+__all__ = ["Array", "Network", "Regions", "area", "contradictions", "partition", "possible", "rounding"]
 
+Array = NDArray[np.float64]
+
+UNIT = 2.0**-24  # relative rounding error of one operation in single precision
+SLACK = 1e-9  # of a Q value; exceeds the rounding of the geometry in double precision
 FLAT = 1e-12  # a value this close to zero is on the line; far below `rounding`
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """q = W_L relu(... relu(W_1 (M z + c) + b_1)) + b_L of z in the plane; the weights are those of the file, exactly.
+
+    weights (in, out) and biases (out,): the first pair is M^T and c and has no relu behind it.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, policy: Policy) -> "Network":
+        weights = (policy.input_matrix.T, *policy.weights)
+        biases = (policy.input_offset, *policy.biases)
+        return cls(*(tuple(np.asarray(a, dtype=np.float64) for a in arrays) for arrays in (weights, biases)))
+
+    @property
+    def hidden(self) -> list[tuple[Array, Array]]:
+        """Layers with a relu, the first combined with the input map."""
+        (m, *inner), (c, *offsets) = self.weights[:-1], self.biases[:-1]
+        layers = list(zip(inner, offsets, strict=True))
+        if layers:
+            w, b = layers[0]
+            layers[0] = (m @ w, c @ w + b)
+        return layers
+
+    @property
+    def output(self) -> tuple[Array, Array]:
+        """The last layer, likewise."""
+        if len(self.weights) == 2:
+            return self.weights[0] @ self.weights[1], self.biases[0] @ self.weights[1] + self.biases[1]
+        return self.weights[-1], self.biases[-1]
+
+
+def rounding(network: Network, points: Array) -> Array:
+    """Bound the error of Q in single precision at points (N, 2), shape (N, A).
+
+    A sum of n products in any order is off by at most g (|h| |W| + |b|), g = (n + 1) u / (1 - (n + 1) u), u = 2^-24
+    (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). relu enlarges no error; an inactive unit
+    passes only the part above zero. On a cell where the network is linear the bound is convex, so its largest value at
+    the corners bounds the inside.
+    """
+    h, error = points, UNIT * np.abs(points)
+    last = len(network.weights) - 1
+    for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        size, n = np.abs(weight), weight.shape[0] + 1
+        gamma = n * UNIT / (1.0 - n * UNIT)
+        error = error @ size + gamma * ((np.abs(h) + error) @ size + np.abs(bias))
+        h = h @ weight + bias
+        if 0 < k < last:
+            error = np.where(h > 0.0, error, np.maximum(h + error, 0.0))
+            h = np.maximum(h, 0.0)
+    return np.asarray(error) + SLACK
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,3 +173,46 @@ def partition(network: Network, box: tuple[tuple[float, float], tuple[float, flo
         exact += _best(rows[:, :2], q, np.zeros(q.shape[1]))
         wider += _best(rows[:, :2], q, rounding(network, rows[:, :2]).max(axis=0))
     return Regions.of(exact), Regions.of(wider)
+
+
+def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Find the actions that may be best in boxes with corners low, high (N, 2); shape (N, A).
+
+    Each unit is an affine form, centre + slopes . (offset in the box) +- rest: a zonotope of two generators and a box.
+    A relu that changes its sign on [l, u] becomes its chord's slope u / (u - l) with a rest of -l u / (2 (u - l)).
+    """
+    centre, slopes, rest = (low + high) / 2.0, np.eye(2) * ((high - low) / 2.0)[:, None, :], np.zeros_like(low)
+    for weight, bias in network.hidden:
+        centre, slopes, rest = centre @ weight + bias, slopes @ weight, rest @ np.abs(weight)
+        reach = np.abs(slopes).sum(axis=1) + rest
+        l, u = centre - reach, centre + reach  # noqa: E741
+        mixed = (l < 0.0) & (u > 0.0)
+        slope = np.where(mixed, u / np.where(mixed, u - l, 1.0), (l >= 0.0).astype(np.float64))
+        half = np.where(mixed, -slope * l / 2.0, 0.0)
+        centre, slopes, rest = slope * centre + half, slope[:, None, :] * slopes, slope * rest + half
+    weight, bias = network.output
+    margin = weight[:, :, None] - weight[:, None, :]
+    off = np.abs(np.einsum("nkh,hab->nkab", slopes, margin)).sum(axis=1)
+    off += np.einsum("nh,hab->nab", rest, np.abs(margin))
+    lead = np.einsum("nh,hab->nab", centre, margin) + (bias[:, None] - bias[None, :])
+    return np.asarray((lead + off >= 0.0).all(axis=2))
+
+
+def contradictions(network: Network, regions: Regions, grid: tuple[int, int]) -> int:
+    """Count corners of polygons whose action the bound of their box excludes, over a grid of boxes on all polygons.
+
+    Gaps or overlaps of the polygons count as one more.
+    """
+    corner = regions.edges[:, 0]
+    low, high = corner.min(axis=0), corner.max(axis=0)
+    size = (high - low) / np.array(grid)
+    cell = np.clip(((corner - low) / size).astype(np.intp), 0, np.array(grid) - 1)
+    found, at = np.unique(cell, axis=0, return_inverse=True)
+    allowed = np.concatenate(
+        [
+            possible(network, low + part * size - 1e-9, low + (part + 1) * size + 1e-9)
+            for part in np.array_split(found, max(1, len(found) // 64))
+        ]
+    )
+    excluded = int((~allowed[at.reshape(-1), regions.action[regions.owner]]).sum())
+    return excluded + int(abs(float(area(regions).sum()) - float(np.prod(high - low))) > 1e-9)

@@ -11,9 +11,8 @@ from dqn.policy import ABSOLUTE, RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
-from experiments.certification.network import Array
-from experiments.certification.od_loop import OdCase, OdLoop
-from experiments.certification.share_loop import ShareCase, ShareLoop
+from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
+from experiments.certification.polygons import Array
 
 __all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
 
@@ -102,7 +101,6 @@ def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
 
 
 def _of_od(policy: Policy, config: CertifyConfig) -> Question:
-    """Build the question of a policy from (OD, setpoint) to a pump rate."""
     model, limits = model_of(policy, config), config.limits
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))
@@ -143,8 +141,6 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     off = EstimateBounds(full, config.error, config.error_od, config.error_share, 0.0, (low, high), (lowest, highest))
     watched = replace(off, od=config.watched_od, growth_share=config.watched_share)
     cases = [ShareCase("nominal", replace(off, error=0.0, od=0.0, growth_share=0.0)), ShareCase("errors", off)]
-    late = {case.name: limits.late for case in cases}
-    drawn = [case.name for case in cases]
     for b in sorted({round(b, 9) for b in (full, *(() if config.quick else config.full_pumps))}):
         own = replace(off, full_pump=b)
         for r in at_setpoints:
@@ -152,14 +148,12 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
             uncertain = replace(own, gain=config.error_gain)
             spread = ShareCase(f"spread doses {at}", uncertain, r)
             slow = ShareCase(f"slow gain error {at}", uncertain, r, slow=True)
-            new = [ShareCase(f"errors {at}", own, r)] if config.quick or setpoints is not None or r == middle else []
-            new += [] if config.quick else [spread, slow]
-            cases += new
-            drawn += [case.name for case in new] if (b, r) == (round(full, 9), middle) else []
-            late |= {case.name: limits.late_slow if case.slow else limits.late for case in new}
+            cases += [ShareCase(f"errors {at}", own, r)] if config.quick or setpoints is not None or r == middle else []
+            cases += [] if config.quick else [spread, slow]
     for r in [middle] if setpoints is None else at_setpoints:
         cases.append(ShareCase(f"watched errors at setpoint {r:g}", watched, r))
-        late[cases[-1].name] = limits.late
+    drawn = [c.name for c in cases if c.setpoint in (None, middle) and round(c.bounds.full_pump - full, 8) == 0.0]
+    late = {case.name: limits.late_slow if case.slow else limits.late for case in cases}
     margins = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
     judged = dict.fromkeys(margins, limits.safe_excess_share)
     loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
@@ -167,7 +161,6 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     box = ((float(clip[0][0]), float(clip[1][0])), (float(seen[0].min()), float(seen[1].max())))
     reached = limits.reached_nominal, limits.reached
     what = "periods of full pump", "growth share"
-    drawn.append(cases[-1].name)
     return Question(
         loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched
     )

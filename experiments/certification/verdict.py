@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from dqn.policy import Policy
-from experiments.certification.intervals import Band, Index, Mask, Pieces, Points, States, images
-from experiments.certification.network import Array
+from experiments.certification.intervals import Band, Index, Mask, Points, images
+from experiments.certification.loops import Loop
+from experiments.certification.polygons import Array
 
-__all__ = ["Loop", "Proof", "attacked", "dose_below", "prove"]
+__all__ = ["Proof", "attacked", "dose_below", "prove"]
 
 STILL = 1e-9  # smaller changes of the state in a period count as zero
 ATTACKED = 60  # periods of an attacking trajectory
@@ -19,33 +20,13 @@ LESS = (0.0, 0.3)  # probabilities of intermediate disturbances, for each half o
 TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities of a change of side, for each quarter of the trajectories
 
 
-class Loop(Protocol):
-    """A family of closed loops with a scalar state, one per strip; cases are disturbances."""
-
-    low: Array
-    high: Array
-
-    @property
-    def growth(self) -> Array: ...
-    def shift(self, case: Any) -> Array: ...
-    def range(self, case: Any) -> Array: ...
-    def seen(self, case: Any) -> tuple[Array, Array]: ...
-    def states(self, case: Any) -> States: ...
-    def law(self, case: Any) -> Pieces: ...
-    def half_width(self, low: Array, high: Array) -> Array: ...
-    def within(self, half_width: Array) -> tuple[Array, Array]: ...
-    def key(self, case: Any) -> object: ...
-    def in_od(self, case: Any, half_width: float) -> float | None: ...
-    def attack(self, case: Any, state: Array, second: Array, push: Array) -> tuple[Array, Array]: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Proof:
     """Proof of a policy under one case, for each strip, (S,).
 
     holdable: without a dose the culture grows, with the full pump it is diluted, under any disturbance.
     band, law: of the policy, and of the one-line controller. half_width, law_half_width: of the bands.
-    margin: allowed half-width beyond the controller's. allowed: [lowest, highest] state of that half-width, (S, 2).
+    allowed: [lowest, highest] state of a half-width that exceeds the controller's by what is allowed, (S, 2).
     entry: periods until the state is allowed, over those of the physics; inf: never.
     grows: below the range of starts every possible dose lets it grow.
     """
@@ -56,7 +37,6 @@ class Proof:
     law: Band
     half_width: Array
     law_half_width: Array
-    margin: float
     allowed: Array
     entry: Array
     grows: Mask
@@ -68,7 +48,7 @@ class Proof:
 
     @property
     def later(self) -> Array:
-        """Periods after the one-line controller until within its half-width plus `margin`, (S,); inf: never."""
+        """Periods after the one-line controller until within `allowed`, (S,); inf: never."""
         of_policy, of_law = (band.until(*self.allowed.T) for band in (self.band, self.law))
         return of_policy - np.where(np.isfinite(of_law), of_law, 0.0)
 
@@ -104,7 +84,6 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
         law,
         loop.half_width(band.low, band.high),
         law_half_width,
-        margin,
         allowed,
         band.until(*allowed.T) / physical(start, shift, allowed),
         np.asarray((~below | (own > 0.0)).all(axis=1)),

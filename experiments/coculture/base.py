@@ -1,16 +1,13 @@
-"""What a law of the composition is told and what it answers: N cultures in, N thermostat targets out."""
+"""What a law of the composition is told of N cultures."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.laws.base import Array, Mask
-from hardware.memory import Remembers
 
-__all__ = ["SEEN", "SEEN_AHEAD", "SHARE", "Acts", "Array", "Law", "Mask", "ShareEstimate", "ShareEstimator", "Wanted"]
+__all__ = ["SEEN", "SEEN_AHEAD", "SHARE", "Array", "Mask", "ShareEstimate", "Wanted"]
 
 SHARE = "share"
 """The signal, by which its laws are known."""
@@ -37,7 +34,6 @@ class ShareEstimate:
     thermometer: Array
 
     def of(self, idx: NDArray[np.intp]) -> "ShareEstimate":
-        """Return the estimate of some of the cultures."""
         return ShareEstimate(*(getattr(self, f.name)[idx] for f in fields(self)))
 
     @property
@@ -67,58 +63,3 @@ class Wanted:
     setpoint: Array
     following: Array
     minutes: Array
-
-
-class ShareEstimator(Remembers, Protocol):
-    """What is believed of N cultures, by their readings and doses; arrays (N,)."""
-
-    @property
-    def begun(self) -> Mask:
-        """Which cultures have been seen."""
-
-    def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
-
-    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Watch a sample: OD, counts, degC, min since the run began; rows: True where it is new and used."""
-
-    def dosed(self, volume_ml: Array) -> None:
-        """Fresh medium that went in since this was last called, mL."""
-
-    def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
-        """Shares counted in samples drawn at a minute since the run began; False where that is too long ago."""
-
-    @property
-    def behind(self) -> bool:
-        """Whether samples are still on their way into the estimate."""
-
-    @property
-    def known(self) -> Array:
-        """Up to which minute `retell` needs nothing of each culture; -inf where it needs all."""
-
-    def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
-        """Minute, method and arguments of what was called in earlier lives of a run, in order, behind `known`."""
-
-    def estimate(self) -> ShareEstimate:
-        """Return the current estimate."""
-
-    def explain(self) -> dict[str, Array]:
-        """Explain the estimate for recording and journal: ratio, ratio_low, ratio_high and more."""
-
-
-class Acts(Protocol):
-    """Chooses thermostat targets from an estimate. Rows are independent."""
-
-    def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
-        """Thermostat targets, degC, (N,), called once per control period of the density.
-
-        A law with a longer period of its own keeps its target until that is over. Args: minute: since the program
-        began, (N,). rows: True where the estimate is new and a setpoint is in force; only these rows' state advances.
-        """
-
-
-class Law(Acts, Remembers, Protocol):
-    """What a run goes on with when it is resumed."""
-
-    def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""

@@ -14,11 +14,9 @@ from experiments.coculture.program import program_of
 from experiments.record.record import Recordings
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["composition_figure", "composition_figure_of", "episodes", "pair_figure"]
+__all__ = ["composition_figure_of", "episodes", "pair_figure"]
 
 Array = NDArray[np.float64]
-Columns = Mapping[str, Array]
-Points = Sequence[Array]
 
 
 def episodes(
@@ -51,26 +49,13 @@ def episodes(
     return figure
 
 
-def composition_figure(
-    columns: Columns,
-    names: Sequence[str],
-    species: str,
-    title: str = "",
-    announced: Sequence[Points] = (),
-    counted: Sequence[Points] = (),
-) -> Figure:
-    """Share with its setpoint and the estimate's 95 % band, temperature with its target, OD, pump rate, fluorescence.
-
-    Args:
-      columns: of the recordings, (N, K) each, nan where a reactor has no sample: time_min, ratio, ratio_low,
-        ratio_high, ratio_setpoint, temperature_degc, temperature_target_degc, od, setpoint, pump_rate_ml_s,
-        fluorescence; true_ratio if known. names: N labels. species: whose share it is.
-      announced: of each reactor, minutes and values of announced changes. counted: minutes, counted shares of samples,
-      and their sds.
-    """
+def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
+    """Share of a species with its setpoint and the estimate's 95 % band, temperature, OD, pump and light of a run."""
     figure, axes = new_figure(8.0, 9.0, 5, 1, sharex=True, height_ratios=[2.4, 1.2, 1.0, 0.8, 1.0])
     share, heat, density, pump, light = axes
-    for n, name in enumerate(names):
+    columns = {**table.columns, "od": table.od(), "setpoint": table.setpoints()}
+    any_counted = False
+    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
         own, colour = {key: values[n] for key, values in columns.items()}, COLOURS[n % len(COLOURS)]
         hours = own["time_min"] / 60.0
         dashed: dict[str, Any] = {"color": "black" if n == 0 else colour, "linewidth": 0.9, "linestyle": "--"}
@@ -80,15 +65,16 @@ def composition_figure(
             label = "truth" if n == 0 else None
             share.plot(hours, own["true_ratio"], color="black", linewidth=0.9, linestyle=":", label=label)
         share.step(hours, own["ratio_setpoint"], where="post", label="setpoint" if n == 0 else None, **dashed)
-        for at, to in announced[n : n + 1]:
-            label = "next setpoint, when announced" if at.size and n == 0 else None
-            share.plot(at / 60.0, to, linestyle="", marker=">", markersize=6.0, color=dashed["color"], label=label)
-        for at, found, sd in counted[n : n + 1]:
-            label = "counted, 95 %" if at.size and not any(c[0].size for c in counted[:n]) else None
-            share.errorbar(
-                at / 60.0, found, 1.96 * sd, linestyle="", marker="s", markersize=4.0, capsize=3.0, color=colour,
-                markeredgecolor="black", ecolor="black", label=label,
-            )  # fmt: skip
+        at, to = _announced(own, scenario)
+        label = "next setpoint, when announced" if at.size and n == 0 else None
+        share.plot(at / 60.0, to, linestyle="", marker=">", markersize=6.0, color=dashed["color"], label=label)
+        mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
+        at, found, sd = np.array(mine, dtype=np.float64).reshape(-1, 3).T
+        share.errorbar(
+            at / 60.0, found, 1.96 * sd, linestyle="", marker="s", markersize=4.0, capsize=3.0, color=colour,
+            markeredgecolor="black", ecolor="black", label="counted, 95 %" if at.size and not any_counted else None,
+        )  # fmt: skip
+        any_counted |= at.size > 0
         heat.plot(hours, own["temperature_degc"], color=colour, linewidth=1.0, label="vial" if n == 0 else None)
         target = own["temperature_target_degc"]
         heat.step(hours, target, where="post", label="thermostat" if n == 0 else None, **dashed)
@@ -107,18 +93,12 @@ def composition_figure(
     return figure
 
 
-def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
-    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
-    announced, counted = [], []
-    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
-        began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
-        minute, share = program_of(scenario).announcements(scenario.announced_min)
-        known = minute + began <= np.nanmax(table.columns["time_min"][n], initial=-np.inf)  # a run may end before
-        announced.append((minute[known] + began, share[known]))
-        mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
-        counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
-    columns = {**table.columns, "od": table.od(), "setpoint": table.setpoints()}
-    return composition_figure(columns, table.names, species, title, announced, counted)
+def _announced(own: Mapping[str, Array], scenario: Scenario) -> tuple[Array, Array]:
+    """Minutes and values of changes that a reactor's run announced; it may end before."""
+    began = np.nanmin(own["time_min"] - own["elapsed_min"], initial=np.inf)
+    minute, share = program_of(scenario).announcements(scenario.announced_min)
+    known = minute + began <= np.nanmax(own["time_min"], initial=-np.inf)
+    return minute[known] + began, share[known]
 
 
 def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure:

@@ -1,6 +1,6 @@
 """Comparison of controllers of the composition: their closed loops, numbers, figures and page."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -25,7 +25,7 @@ from experiments.coculture.signal import TRUE, Share
 from experiments.comparison import page, run, statistics, studies, trials
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.figures import by_plant, estimate
-from experiments.comparison.page import Row, Section, law_of, matrix, scaled
+from experiments.comparison.page import Measure, Row, Section, law_of, scaled, tables
 from experiments.comparison.statistics import Spread
 from experiments.comparison.studies import Drawing
 from experiments.comparison.trials import Cell, Followed, Trial, closed, record
@@ -50,6 +50,7 @@ FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # laws that act 
 COLUMNS = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
 """Fields of a `ShareTrial` and the columns of a recording that they are."""
 
+ERRORS = {"_mean": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
 SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
 STEP = 5  # minutes between the points of a share's curve
 LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
@@ -80,7 +81,6 @@ class ShareCell(Cell):
 
     @property
     def vials(self) -> tuple[object, ...]:
-        """See `Cell.vials`."""
         return *super().vials, self.density, self.calibrated
 
 
@@ -101,7 +101,6 @@ class ShareTrial(Trial):
     od: Array
 
     def names(self) -> dict[str, Any]:
-        """See `Trial.names`."""
         cell = cast(ShareCell, self.cell)
         beside = {"preview": self.foresight, "density": cell.density, "calibrated": cell.calibrated}
         return super().names() | beside
@@ -162,20 +161,15 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
 
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
     """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
-    found: dict[str, Followed | None] = {}
+    found, two = dict[str, Followed | None](), of_benchmark(config)
     for name in names:
         kept = folder / "policies" / name
         kept.mkdir(parents=True, exist_ok=True)
-        where = of_benchmark(config).composition_policies.get(name, "shipped")
-        policy = composition_policy(of_benchmark(config).compositions[name].kind, where, kept, resumed=False)
+        where = two.composition_policies.get(name, "shipped")
+        policy = composition_policy(two.compositions[name].kind, where, kept, resumed=False)
         if policy is not None:
             try:
-                registry.build(
-                    of_benchmark(config).compositions[name],
-                    SHARE,
-                    policy=policy,
-                    pair=read_pair(of_benchmark(config).pair),
-                )
+                registry.build(two.compositions[name], SHARE, policy=policy, pair=read_pair(two.pair))
             except ValueError as error:
                 remedy = f"give composition_policies.{name}=RUN, or studies.NAME.compositions without {name}"
                 raise frame.UserError(f"{error}; {remedy}") from None
@@ -183,9 +177,9 @@ def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> 
     return found
 
 
-def abs_error(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| wherever a share is asked for, (N,)."""
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint), axis=1))
+def abs_error(trial: ShareTrial, since: int = 0) -> Array:
+    """Mean |r - setpoint| from a minute on wherever a share is asked for, (N,)."""
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, since:], axis=1))
 
 
 def last_hours(trial: ShareTrial) -> Array:
@@ -201,16 +195,9 @@ def last_hours(trial: ShareTrial) -> Array:
     return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
 
 
-def _last_day(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| of the last day of a run of two days or more, else nan, (N,)."""
-    if trial.minute[-1] < 2 * DAY_MIN:
-        return np.full(len(trial.share), np.nan)
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, -DAY_MIN:], axis=1))
-
-
 def share_row(trial: ShareTrial) -> dict[str, Any]:
     """Build the row of a share in summary.json, judged by the true share."""
-    error = Spread(abs_error(trial))
+    error, days = Spread(abs_error(trial)), trial.minute[-1] >= 2 * DAY_MIN
     inside = (trial.low <= trial.share) & (trial.share <= trial.high)
     return trial.names() | {
         "n": error.n,
@@ -218,7 +205,7 @@ def share_row(trial: ShareTrial) -> dict[str, Any]:
         "ratio_abs_error_sd": error.sd,
         "ci95": error.ci95,
         "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
-        "ratio_abs_error_last_day": Spread(_last_day(trial)).mean,
+        "ratio_abs_error_last_day": Spread(abs_error(trial, -DAY_MIN)).mean if days else float("nan"),
         "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
         "band_covers": float(inside.mean()),
         "od_min": float(trial.od.min()),
@@ -294,29 +281,18 @@ def _od(row: Row) -> str:
 
 
 def _section(out: Page, summary: Row, run: Path) -> None:
-    """Add a section of every scenario."""
-    errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
-    for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
+    rows, note = summary["rows"], "n = {n} reactors each."
+    for scenario in dict.fromkeys(str(r["scenario"]) for r in rows):
         out.section(scenario)
-
-        def add(
-            key: str, entries: Sequence[Row], title: str, text: Callable[[Row], str],
-            ranked_by: str | None = None, folded: str = "", scenario: str = scenario,
-        ) -> None:  # fmt: skip
-            entries = [e for e in entries if e["scenario"] == scenario]
-            if entries:
-                note = f"n = {entries[0]['n']} reactors each."
-                table = matrix(f"{scenario}_{key}", title, entries, text, note, ranked_by, laws_down=True)
-                out.table(table, folded=folded and f"{folded}: {scenario}")
-
-        rows = summary["rows"]
-        for ending, when in errors.items():
-            key = f"ratio_abs_error{ending or '_mean'}"
-            known = [r for r in rows if r[key] is not None]
-            add(key, known, f"Mean |r - setpoint|{when}", partial(scaled, key=key), key)
-        add("paired", summary["paired"], "Difference to the vendor's PI", _lower)
-        add("estimate", rows, "Error of the estimate (rms), and how much its band covers", _estimate, folded="Estimate")
-        add("od", rows, "OD: least, mean, largest", _od, folded="OD")
+        add = partial(tables, out, scenario, laws_down=True)
+        for ending, when in ERRORS.items():
+            key = f"ratio_abs_error{ending}"
+            measure = Measure(key, f"Mean |r - setpoint|{when}", partial(scaled, key=key), note, key)
+            add([r for r in rows if r[key] is not None], measure)
+        add(summary["paired"], Measure("paired", "Difference to the vendor's PI", _lower, note))
+        title = "Error of the estimate (rms), and how much its band covers"
+        add(rows, Measure("estimate", title, _estimate, note, folded=True))
+        add(rows, Measure("od", "OD: least, mean, largest", _od, note, folded=True))
         for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
             out.figure(run / f["file"], f["title"], f["caption"])
 

@@ -104,29 +104,24 @@ class OfBenchmark:
         asks = [key for key, s in config.scenarios.items() if composed(s)]
         plants = [key for key, p in config.plants.items() if of_plant(p).second.present]
         for name, study in of_two.items():
-            unknown = [law for law in of_study(study).compositions if law not in self.compositions]
-            if unknown:
-                raise ValueError(f"studies.{name}.compositions: {unknown[0]} is none of {', '.join(self.compositions)}")
             for key, given, having, known in (
-                ("scenarios", study.scenarios, "those with ratios", asks),
-                ("plants", study.plants, "those with two species", plants),
+                ("compositions", of_study(study).compositions, "", [*self.compositions]),
+                ("scenarios", study.scenarios, "those with ratios: ", asks),
+                ("plants", study.plants, "those with two species: ", plants),
             ):
                 wrong = next((one for one in given if one not in known), None)
-                require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}: {', '.join(known)}")
+                require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}{', '.join(known)}")
 
 
 def of_study(study: StudyConfig) -> OfStudy:
-    """Return a study as what two species are told by."""
     return cast(OfStudy, study)
 
 
 def of_benchmark(config: BenchmarkConfig) -> OfBenchmark:
-    """Return a benchmark's config as what two species are told by."""
     return cast(OfBenchmark, config)
 
 
 def of_deploy(config: DeployConfig) -> OfDeploy:
-    """Return a deployment's config as what two species are told by."""
     return cast(OfDeploy, config)
 
 

@@ -7,7 +7,7 @@ from dqn import policy
 from envs import scenario
 from envs.coculture.task import CocultureConfig
 from envs.scenario import Scenario
-from experiments.coculture import laws, learned, planned
+from experiments.coculture import laws
 from experiments.coculture.base import SEEN, SEEN_AHEAD, SHARE
 from experiments.coculture.config import OfBenchmark, OfDeploy, OfEmulator, OfStudy, OfTrain, completed
 from experiments.coculture.program import Ratios, composed
@@ -34,16 +34,16 @@ needs = "needs a policy; give policy=RUN/policy.npz of a training with env=cocul
 plans = "plans the whole program; give a scenario with ratios"
 registry.hold(SHARE, "composition", {"policy": Part(missing=needs), "program": Part(missing=plans), "pair": Part()})
 for kind, config, law, parts in (
-    ("dqn", learned.LearnedLawConfig, learned.LearnedLaw, ("policy", "pair")),
-    ("dqn_preview", learned.PreviewLawConfig, learned.LearnedLaw, ("policy", "pair")),
+    ("dqn", laws.LearnedLawConfig, laws.LearnedLaw, ("policy", "pair")),
+    ("dqn_preview", laws.PreviewLawConfig, laws.LearnedLaw, ("policy", "pair")),
     ("pi", laws.PIConfig, laws.PI, ("pair",)),
     ("proportional", laws.ProportionalConfig, laws.Proportional, ("pair",)),
     ("inverse_dynamics", laws.InverseDynamicsConfig, laws.InverseDynamics, ("pair",)),
     ("bang_bang", laws.BangBangConfig, laws.BangBang, ("pair",)),
     ("myopic", laws.MyopicConfig, laws.Myopic, ("pair",)),
     ("midpoint", laws.MidpointConfig, laws.Midpoint, ("pair",)),
-    ("receding", planned.RecedingConfig, planned.Receding, ("pair",)),
-    ("optimum", planned.OptimumConfig, planned.Optimum, ("program", "pair")),
+    ("receding", laws.RecedingConfig, laws.Receding, ("pair",)),
+    ("optimum", laws.OptimumConfig, laws.Optimum, ("program", "pair")),
 ):
     registry.add(kind, config, law, "", parts, SHARE)
 for observation in (SEEN, SEEN_AHEAD):

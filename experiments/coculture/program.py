@@ -56,7 +56,6 @@ class Ratios:
 
 
 def ratios_of(scenario: Scenario) -> Ratios:
-    """Return a scenario as what asks for a share."""
     return cast(Ratios, scenario)
 
 
@@ -72,7 +71,6 @@ def resting(scenario: Scenario, even_c: float) -> Scenario:
 
 
 def program_of(scenario: Scenario) -> "Program":
-    """Return the program of the share in a schedule."""
     asked = ratios_of(scenario)
     if asked.ratio_sine:
         mean, amplitude, period = asked.ratio_sine
@@ -86,43 +84,25 @@ class Program(Phased):
     """Shares of the second species, one of each phase (nan: none is asked for), or a sine.
 
     sine: mean, amplitude and period in min of s(t) = mean - amplitude sin(2 pi t / period), t from the program's
-    beginning; `ratios` then says only in which phases it holds (nan: not there), and empty: in all.
-    minutes: length of each phase. Raises: ValueError for a share outside 0 to 1 or lists of unequal length.
+    beginning. minutes: length of each phase.
     """
 
     ratios: tuple[float, ...] = ()
     minutes: tuple[float, ...] = (60.0,)
     sine: tuple[float, float, float] | None = None
 
-    def __post_init__(self) -> None:
-        fits = len(self.ratios) == len(self.minutes) or (self.sine is not None and not self.ratios)
-        require(fits, "scenario.ratios", self.ratios, f"one of each of the {len(self.minutes)} phases, null where none")
-        inside = all(math.isnan(r) or 0.0 < r < 1.0 for r in self.ratios)
-        require(inside, "scenario.ratios", self.ratios, "each 0 < share < 1, or null where none is asked for")
-        if self.sine is not None:
-            mean, amplitude, period = self.sine
-            fits = mean - abs(amplitude) > 0.0 and mean + abs(amplitude) < 1.0 and period > 0.0
-            require(fits, "scenario.ratio_sine", self.sine, "mean, amplitude, period with 0 < mean +- amplitude < 1")
-
-    @property
-    def asked(self) -> bool:
-        """Whether a share is asked for in any phase."""
-        return self.sine is not None or any(not math.isnan(r) for r in self.ratios)
-
     def _phase(self, minute: Array) -> NDArray[np.intp]:
-        index = np.searchsorted(self.edges[1:], minute + 1e-9, side="right")
-        return np.asarray(np.minimum(index, len(self.minutes) - 1), dtype=np.intp)
+        return np.minimum(np.searchsorted(self.edges[1:], minute + 1e-9, side="right"), len(self.minutes) - 1)
 
     def setpoint(self, minute: Array) -> Array:
         """Share asked for at each minute, nan where none is and before the start; the last one after the end."""
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)
-        phase = self._phase(np.maximum(at, 0.0))
         if self.sine is None:
-            return np.where(at < 0.0, np.nan, np.asarray(self.ratios)[phase])
-        mean, amplitude, period = self.sine
-        wanted = mean - amplitude * np.sin(2.0 * np.pi * np.clip(at, 0.0, self.total_min) / period)
-        none = np.isnan(np.asarray(self.ratios))[phase] if self.ratios else np.zeros(at.shape, dtype=np.bool_)
-        return np.where((at < 0.0) | none, np.nan, wanted)
+            wanted = np.asarray(self.ratios)[self._phase(np.maximum(at, 0.0))]
+        else:
+            mean, amplitude, period = self.sine
+            wanted = mean - amplitude * np.sin(2.0 * np.pi * np.clip(at, 0.0, self.total_min) / period)
+        return np.where(at < 0.0, np.nan, wanted)
 
     def wanted(self, minute: Array, preview_min: float = 0.0) -> Wanted:
         """Return what a law is told at each minute since the program began, (N,).
@@ -132,16 +112,16 @@ class Program(Phased):
         """
         now = self.setpoint(minute)
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)
-        if self.sine is not None:
+        if self.sine is None:
+            phase, (change, following) = self._phase(np.maximum(at, 0.0)), self._changes()
+            ahead, left = following[phase], change[phase] - at
+            known = left <= preview_min + 1e-9
+        else:
             lead = min(SINE_LEAD_MIN, preview_min)
-            ahead = self.setpoint(at + lead)
-            known = np.isfinite(ahead) & np.isfinite(now) & (lead > 0.0) & (at + lead <= self.total_min)
-            return Wanted(now, np.where(known, ahead, now), np.where(known, SINE_STEP * lead, 0.0))
-        change, following = self._changes()
-        left = change[self._phase(np.maximum(at, 0.0))] - at
-        known = (left <= preview_min + 1e-9) & np.isfinite(now) & (preview_min > 0.0)
-        announced = following[self._phase(np.maximum(at, 0.0))]
-        return Wanted(now, np.where(known, announced, now), np.where(known, left, 0.0))
+            ahead, left = self.setpoint(at + lead), np.full(at.shape, SINE_STEP * lead)
+            known = np.isfinite(ahead) & (at + lead <= self.total_min)
+        known &= np.isfinite(now) & (preview_min > 0.0)
+        return Wanted(now, np.where(known, ahead, now), np.where(known, left, 0.0))
 
     @property
     def extremes(self) -> tuple[float, ...]:
@@ -158,14 +138,12 @@ class Program(Phased):
         when, which = self._changes()
         known = np.isfinite(self.ratios) & np.isfinite(when)
         first = known & np.append(True, when[1:] != when[:-1])  # of phases that follow each other with one share
-        start = self.edges[:-1]
-        return np.maximum(when - preview_min, start)[first], which[first]
+        return np.maximum(when - preview_min, self.edges[:-1])[first], which[first]
 
     def _changes(self) -> tuple[Array, Array]:
         """Of each phase: when another share is asked for next, inf where never, and which."""
-        n = len(self.minutes)
-        when, which = np.full(n, np.inf), np.array(self.ratios, dtype=np.float64)
-        for k in range(n - 2, -1, -1):
+        when, which = np.full(len(self.minutes), np.inf), np.array(self.ratios, dtype=np.float64)
+        for k in range(len(which) - 2, -1, -1):
             now, after = self.ratios[k], self.ratios[k + 1]
             if after == now:
                 when[k], which[k] = when[k + 1], which[k + 1]

@@ -53,7 +53,6 @@ class Recall:
         self._again: Again | None = None
 
     def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
         self.estimator.reset(n)
         self._forget()
         self.earliest = copy.deepcopy(self.estimator)
@@ -62,12 +61,10 @@ class Recall:
         self._chapters, self._again = [], None
 
     def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
-        """See `CompositionEstimator.calibrate`."""
         self.estimator.calibrate(factor, factor_sd, offset, offset_sd)
 
     @property
     def begun(self) -> Mask:
-        """Which cultures have been seen."""
         return self.estimator.begun
 
     @property
@@ -77,11 +74,9 @@ class Recall:
 
     @property
     def behind(self) -> bool:
-        """Whether samples are on their way into the estimate."""
         return self._again is not None
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `CompositionEstimator.watch`."""
         if not rows.any():
             return
         now = float(minute[rows].max())
@@ -100,7 +95,6 @@ class Recall:
         self.earliest = self._chapters[0].then
 
     def dosed(self, volume_ml: Array) -> None:
-        """See `CompositionEstimator.dosed`."""
         if self._chapters:
             self._show(self._last(), "dosed", (np.array(volume_ml),))
         else:
@@ -170,9 +164,7 @@ class Recall:
                 self._chapters[again.chapter].then = copy.deepcopy(again.estimator)
 
     def estimate(self) -> ShareEstimate:
-        """Return the current estimate."""
         return self.estimator.estimate()
 
     def explain(self) -> dict[str, Array]:
-        """See `CompositionEstimator.explain`."""
         return self.estimator.explain()

@@ -68,16 +68,13 @@ class TwoSpecies(Guest):
         return [LightSignal()] if lit and not config.signals else []
 
     def vials(self, config: DeployConfig) -> str:
-        """See `Guest.vials`."""
         return "" if of_deploy(config).composition is None else VIALS
 
     def deciders(self, config: DeployConfig) -> list[tuple[str, str]]:
-        """See `Guest.deciders`."""
         composition = of_deploy(config).composition
         return [] if composition is None else [("share", str(composition.kind))]
 
     def asked(self, scenario: Scenario, phase: int) -> str:
-        """See `Guest.asked`."""
         ratios = ratios_of(scenario).ratios
         share = ratios[phase] if ratios else None
         return "" if share is None else f"share {share:g}, which decides the temperature"

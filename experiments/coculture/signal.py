@@ -14,8 +14,10 @@ from envs.bench import Bench
 from envs.coculture.task import logit
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.coculture.base import Array, Law, Mask, ShareEstimator, Wanted
+from experiments.coculture.base import Array, Mask, Wanted
+from experiments.coculture.laws import Periodic
 from experiments.coculture.program import program_of
+from experiments.coculture.recall import Recall
 from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
@@ -62,7 +64,6 @@ class LightSignal:
         return np.full(sample.rows.shape, np.nan)
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """See `Signal.find`."""
         light = sample.measured.fluorescence
         return Findings({"fluorescence": np.full(sample.rows.shape, np.nan) if light is None else light})
 
@@ -75,8 +76,8 @@ class Decider:
     """What is believed of the share, and what is done about it."""
 
     remembers = ("estimator", "law")
-    estimator: ShareEstimator
-    law: Law
+    estimator: Recall
+    law: Periodic[Any]
 
 
 class Share:
@@ -96,8 +97,8 @@ class Share:
 
     def __init__(
         self,
-        estimator: ShareEstimator,
-        law: Law,
+        estimator: Recall,
+        law: Periodic[Any],
         schedules: Sequence[Scenario],
         warnings: ShareWarnings | None = None,
         simulated: bool = False,
@@ -119,7 +120,6 @@ class Share:
         return (*COLUMNS, TRUE) if self.simulated else COLUMNS
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
-        """See `Knows.known`."""
         self.truth = lambda: plant.culture.share
 
     def decide(self, sample: Sample) -> Array:
@@ -131,7 +131,6 @@ class Share:
         return np.where(asked, self.law.act(self.estimator.estimate(), wanted, sample.elapsed, on), np.nan)
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """See `Signal.find`."""
         m, wanted, believed = sample.measured, self.wanted(sample.elapsed), self.estimator.explain()
         known = {"ratio_setpoint": wanted.setpoint, "temperature_target_degc": given}
         known |= {"fluorescence": np.full(m.od.shape, np.nan) if m.fluorescence is None else m.fluorescence}
@@ -195,7 +194,6 @@ class Share:
         return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.warnings.wide_h))
 
     def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
-        """See `Counted.counted`."""
         mine = np.arange(len(self.schedules)) == n
         told = self.estimator.explain()
         before, band = told["ratio"][n], told["ratio_high"][n] - told["ratio_low"][n]
@@ -210,7 +208,6 @@ class Share:
         return f"estimated {before:.3f} before it; {after}{doubt if surprising else ''}", surprising
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """See `Counted.retell`."""
         known, told = self.estimator.known + 1e-3, []  # minutes are recorded to 1e-4
         mine = np.eye(len(rows), dtype=np.bool_)
         for n, c in enumerate(rows):
@@ -231,7 +228,6 @@ class Share:
 
     @property
     def memory(self) -> Remembers:
-        """See `Signal.memory`."""
         return self
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
@@ -239,7 +235,6 @@ class Share:
         self.estimator.dosed(volume_ml)
 
     def draw(self, table: Any, title: str) -> dict[str, Any]:
-        """See `Draws.figures`."""
         from experiments.coculture.charts import composition_figure_of  # Matplotlib
 
         return {"composition": composition_figure_of(table, self.schedules, self.species, title)}

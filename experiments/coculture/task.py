@@ -67,7 +67,6 @@ class Coculture:
             end[LOGIT], end[TEMPERATURE] = span, temperature  # beyond what is trained a policy sees the end of it
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> CocultureVectorEnv:
-        """Environments."""
         env = CocultureVectorEnv(len(seeds), self.config)
         env.seed_streams(seeds)
         return env
@@ -115,11 +114,9 @@ class Coculture:
         return np.concatenate([state, passed(c, observation[..., 3:])], axis=-1), error
 
     def asked(self, start: Array) -> Array:
-        """Return the last setpoint of the episode."""
         return np.asarray(start[:, NEXT if self.config.preview_min else SETPOINT].round(9))
 
     def best(self, start: Array) -> Rollout:
-        """By backward induction over the program of each start."""
         model = transitions(self.config, FINE)
         programs, which = np.unique(start[:, 3:].round(9), axis=0, return_inverse=True)
         shape = (self.steps, 1, len(start))
@@ -146,7 +143,6 @@ class Coculture:
         return action.reshape(observation.shape[:-1])
 
     def model(self) -> dict[str, Any]:
-        """Control period and the whole model."""
         return {"control_min": self.config.control_min, "model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:

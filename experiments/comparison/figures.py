@@ -42,12 +42,10 @@ MARKS = {
 
 
 def _mark(controller: str) -> tuple[str, str]:
-    """Return colour and marker of a controller."""
     return MARKS.get(controller, (COLOURS[0], "X"))
 
 
 def _handles(controllers: Sequence[str]) -> list[Line2D]:
-    """Return the entries of a legend."""
     return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
 
 
@@ -214,7 +212,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """Draw paired differences of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval.
 
-    Args: entries: of `statistics.total_pairs`, all of one scenario; against: the controller at zero.
+    Args: entries: of `statistics.pairs` by `total_scores`, all of one scenario; against: the controller at zero.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
     open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")

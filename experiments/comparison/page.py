@@ -12,8 +12,8 @@ from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
 __all__ = [
-    "RANKED", "SECTIONS", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "scaled",
-    "table_2",
+    "RANKED", "SECTIONS", "Measure", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses",
+    "scaled", "table_2", "tables",
 ]  # fmt: skip
 
 Row = Mapping[str, Any]
@@ -45,12 +45,6 @@ DENSITY = {
     "comparisons.",
     "±": "one standard deviation over replicates.",
 }
-ESTIMATES = (
-    ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
-    ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
-    ("supervised_pct", "Decisions by the supervisor's controller, %"),
-    ("alarm_pct", "Of these, because of innovations, %"),
-)
 RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
 """Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
 OUT_OF_COMPETITION = ("oracle", "optimum")
@@ -83,7 +77,6 @@ def _mark(text: str, best: bool) -> str:
 
 
 def beside(summary: Row) -> list[Row]:
-    """List the rows beside the paper's table."""
     keys = ("controller", "plant", "scenario", "window")
     chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
     return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
@@ -120,30 +113,6 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
         tuple(body),
         f"Published: real reactors, n = 3. Here: simulation, n = {n}, mean ± standard deviation over replicates; "
         "plants " + ", ".join(dict.fromkeys(str(r["plant"]) for r in rows)) + ". Marked: lowest of the three.",
-    )
-
-
-def cell_by_cell(rows: Sequence[Row]) -> Table:
-    """Compare the published value and this run's for each controller, in both conventions, and name the lower one."""
-    body = []
-    for p in TABLE_2:
-        row = _find(rows, controller=p.controller, scenario=p.scenario, window=p.window)
-        if row is None:
-            continue
-        cells = [f"{name_of(p.scenario, p.window)}, {p.controller}"]
-        for metric in METRICS:
-            published, ours = getattr(p, metric), row[f"{metric}_mean"]
-            cells += [f"{number(published, 4)} ({number(published / 30.0)})", f"{number(ours)} ({number(ours / 30.0)})"]
-            cells.append("here" if ours < published else "published")
-        body.append(tuple(cells))
-    columns = ("cell", *(f"{m.upper()}{what}" for m in METRICS for what in (", published", ", here", ", lower")))
-    return Table(
-        "table2_cells",
-        "Table 2 cell by cell: T = 1 min, and in brackets T = window",
-        columns,
-        tuple(body),
-        "T = window: the integrals divided by 30 min. A lower value here means that a simulated culture is held closer "
-        "than the published one, not that the controller is better: plant, pump and start are not the paper's.",
     )
 
 
@@ -246,41 +215,32 @@ def _percent(pair: Row) -> str:
     return f"{pair['percent']:+.1f} [{scale * low:+.1f}, {scale * high:+.1f}]"
 
 
-def every_plant(out: Page, summary: Row, scenario: str) -> None:
-    """Tables of one scenario on every plant."""
-    totals = [e for e in summary["totals"] if e["scenario"] == scenario]
-    pairs = [e for e in summary["paired_totals"] if e["scenario"] == scenario]
-    n = totals[0]["n"]
-    out.add("subheading", text=scenario)
-    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²")):
-        table = matrix(
-            f"{scenario}_{metric}",
-            f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
-            totals,
-            partial(_mean_sd, metric=metric, scale=scale),
-            f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
-            ranked_by=f"{metric}_mean",
-            floor=partial(scaled, key=f"floor_{metric}", scale=scale),
-        )
-        out.table(table)
-    for against, heading in (
-        ("oracle", "Distance from the oracle"),
-        ("dqn", "Paired difference to the learned policy"),
-        ("dqn_adaptive", "Paired difference to the adaptive policy"),
-    ):
-        for metric in METRICS:
-            chosen = [p for p in pairs if p["against"] == against and p["metric"] == metric]
-            if chosen:
-                table = matrix(
-                    f"{scenario}_{metric}_vs_{against}",
-                    f"{heading}, {metric.upper()}, %",
-                    chosen,
-                    _percent,
-                    f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {n}. Where "
-                    f"{against}'s mean is 0 the difference itself.",
-                )
-                out.table(table, folded=f"{heading}, {metric.upper()}: {scenario}")
-    extra = (
+class Measure(NamedTuple):
+    """A table of every law on every plant of a scenario. note: {n} is the number of replicates."""
+
+    key: str
+    title: str
+    text: Callable[[Row], str]
+    note: str
+    ranked_by: str | None = None
+    floor: Callable[[Row], str] | None = None
+    folded: bool = False
+
+
+SCORES = [
+    Measure(
+        metric,
+        f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
+        partial(_mean_sd, metric=metric, scale=scale),
+        "Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
+        f"{metric}_mean",
+        partial(scaled, key=f"floor_{metric}", scale=scale),
+    )
+    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²"))
+]
+FURTHER = [
+    Measure(key, title, partial(scaled, key=key), "Mean, n = {n}.", key if ranked else None, folded=True)
+    for key, title, ranked in (
         ("itae_median", "ITAE of the measured OD (OD min²), sum over the windows, median over vials", True),
         ("clean_ise", "ISE of the noise-free OD (OD² min), sum over the windows", True),
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
@@ -289,18 +249,48 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ("media_ml", "Fresh medium used (mL per vial)", False),
         ("held", "Samples on which the interlock allowed no dose, per vial", False),
     )
-    for key, title, ranked in extra:
-        ranking = key if ranked else None
-        table = matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), f"Mean, n = {n}.", ranking)
-        out.table(table, folded=f"{title}: {scenario}")
+]
+ESTIMATES = [
+    Measure(key, title, partial(scaled, key=key), "{scenario}; mean, n = {n}.")
+    for key, title in (
+        ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
+        ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
+        ("supervised_pct", "Decisions by the supervisor's controller, %"),
+        ("alarm_pct", "Of these, because of innovations, %"),
+    )
+]
+
+
+def tables(out: Page, scenario: str, entries: Sequence[Row], *measures: Measure, laws_down: bool = False) -> None:
+    """Add the tables of one scenario, where there are entries."""
+    known = [e for e in entries if e["scenario"] == scenario]
+    for m in measures if known else ():
+        note = m.note.format(n=known[0]["n"], scenario=scenario)
+        table = matrix(f"{scenario}_{m.key}", m.title, known, m.text, note, m.ranked_by, m.floor, laws_down)
+        out.table(table, folded=f"{m.title}: {scenario}" if m.folded else "")
+
+
+def every_plant(out: Page, summary: Row, scenario: str) -> None:
+    """Tables of one scenario on every plant."""
+    out.add("subheading", text=scenario)
+    tables(out, scenario, summary["totals"], *SCORES)
+    for against, heading in (
+        ("oracle", "Distance from the oracle"),
+        ("dqn", "Paired difference to the learned policy"),
+        ("dqn_adaptive", "Paired difference to the adaptive policy"),
+    ):
+        for metric in METRICS:
+            chosen = [p for p in summary["paired_totals"] if p["against"] == against and p["metric"] == metric]
+            note = f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {{n}}. Where "
+            note += f"{against}'s mean is 0 the difference itself."
+            title = f"{heading}, {metric.upper()}, %"
+            tables(out, scenario, chosen, Measure(f"{metric}_vs_{against}", title, _percent, note, folded=True))
+    tables(out, scenario, summary["totals"], *FURTHER)
 
 
 def estimates(out: Page, summary: Row, scenario: str) -> None:
     """Tabulate the uncertainty and coverage of controllers with an estimator on every plant of a scenario."""
-    totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
-    for key, title in ESTIMATES if totals else ():
-        note = f"{scenario}; mean, n = {totals[0]['n']}."
-        out.table(matrix(f"{scenario}_{key}", title, totals, partial(scaled, key=key), note))
+    tables(out, scenario, [e for e in summary["totals"] if ESTIMATES[0].key in e], *ESTIMATES)
 
 
 def all_rows(summary: Row) -> Table:
@@ -398,48 +388,6 @@ def _beside_paper(out: Page, summary: Row) -> None:
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
 
 
-def _paper_section(out: Page, summary: Row) -> None:
-    rows = beside(summary)
-    out.section("The paper's Table 2 beside this run")
-    for metric in METRICS:
-        out.table(table_2(rows, metric))
-    out.table(cell_by_cell(rows))
-    if bounded := _below_bound(summary):
-        out.text(bounded)
-
-
-def _below_bound(summary: Row) -> str:
-    """Name published ISE below the oracle's on the training model, if the oracle was run on it."""
-    found = []
-    for p in TABLE_2:
-        if p.scenario != "setpoint_steps":
-            continue
-        row = _find(summary["rows"], controller="oracle", plant="nominal", scenario=p.scenario, window=p.window)
-        if row is not None and p.ise < row["ise_mean"]:
-            found.append(f"{p.controller} at {name_of(p.scenario, p.window)} ({p.ise:g} against {row['ise_mean']:.3f})")
-    if not found:
-        return ""
-    return (
-        "Published ISE below what even the oracle reaches on the nominal model, where the pump limits a step down: "
-        + ", ".join(found)
-        + ". The paper's pump outran its culture's growth by more than the nominal values allow, or its step began "
-        "lower; it reports neither."
-    )
-
-
-def _settings(agents: Mapping[str, Row]) -> Table | None:
-    """Tabulate the hyper-parameters that differ between the agents of this run."""
-    trained = {name: entry["agent"] for name, entry in agents.items() if "agent" in entry}
-    if len(trained) < 2:
-        return None
-    keys = [k for k in next(iter(trained.values())) if len({str(agent[k]) for agent in trained.values()}) > 1]
-    body = tuple((k, *(str(agent[k]).replace("[]", "none") for agent in trained.values())) for k in keys)
-    return Table(
-        "agents", "What tells the agents apart", ("hyper-parameter", *trained), body,
-        "dqn_paper: what the paper states, and what is customary where it says nothing. Everything else is the same.",
-    ) if keys else None  # fmt: skip
-
-
 def _learning_section(out: Page, summary: Row, run: Path) -> None:
     first = [f for f in summary["figures"] if f["file"].startswith(("training/", "figures/fig2a"))]
     if not first and not summary["agents"]:
@@ -452,8 +400,6 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
             for k in ("mu", "tau")
         ]
         out.text(f"Calibration: {', '.join(parts)}; PMSE {number(fitted['pmse_pct'])} %.")
-    if settings := _settings(summary["agents"]):
-        out.table(settings)
     for name, entry in summary["agents"].items():
         regret = entry["regret_pct"]
         shown = ", ".join(number(r) for r in regret) if isinstance(regret, list) else number(regret)
@@ -466,7 +412,9 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
 def _density(out: Page, summary: Row, run: Path) -> None:
     """Add the paper's table, the figures, every plant."""
     if summary["beside_paper"]:
-        _paper_section(out, summary)
+        out.section("The paper's Table 2 beside this run")
+        for metric in METRICS:
+            out.table(table_2(beside(summary), metric))
     regulated = _find(summary["rows"], controller="dqn", scenario="regulation")
     rest = [f for f in summary["figures"] if not f["file"].startswith(("training/", "figures/fig2a"))]
     if rest:
@@ -491,7 +439,7 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
-    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0][0] in e)
+    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0].key in e)
     if estimated:
         out.section("How sure the estimates were, and what the supervisor did")
         for scenario in estimated:
@@ -512,7 +460,6 @@ SECTIONS = {
 
 
 def of_benchmark(run: Path) -> Page:
-    """Build the page of a benchmark's run folder."""
     guests.load("experiments.comparison")
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]

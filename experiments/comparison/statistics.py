@@ -1,7 +1,7 @@
 """Statistics of trials: means with intervals, and paired differences between controllers on the same draws."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,10 @@ from scipy.stats import t as student
 from experiments.comparison.trials import DensityTrial, Trial, Window, windows
 
 __all__ = [
-    "ROWS", "SCORES", "Scored", "Spread", "details", "pairs", "row", "rows", "total_pairs", "totals",
+    "ROWS", "SCORES", "Scored", "Spread", "details", "pairs", "row", "rows", "total_scores", "totals",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
-T = TypeVar("T", bound=Trial)
 METRICS = ("ise", "itae")
 TOLD = {
     "supervised_pct": "supervised", "alarm_pct": "alarm", "error_2sd_pct": "error", "share_2sd_pct": "growth_share",
@@ -52,24 +51,19 @@ class Spread:
 def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
     """Build one row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
-    ise, itae = Spread(score.ise), Spread(score.itae)
+    of = {metric: Spread(getattr(score, metric)) for metric in METRICS}
+    columns = [(m, part) for parts in (("mean", "sd"), ("median",), ("ci95",)) for m in METRICS for part in parts]
     settled = float(np.median(np.nan_to_num(score.settling_min, nan=np.inf)))  # "never" is infinity
-    return trial.names() | {
-        "window": window.label,
-        "setpoint": window.setpoint,
-        "n": ise.n,
-        "ise_mean": ise.mean,
-        "ise_sd": ise.sd,
-        "itae_mean": itae.mean,
-        "itae_sd": itae.sd,
-        "ise_median": ise.median,
-        "itae_median": itae.median,
-        "ise_ci95": ise.ci95,
-        "itae_ci95": itae.ci95,
-        "settling_min": settled if np.isfinite(settled) else float("nan"),
-        "steady_abs_error": Spread(score.steady_abs_error).mean,
-        "media_ml": Spread(trial.media(window)).mean,
-    }
+    return (
+        trial.names()
+        | {"window": window.label, "setpoint": window.setpoint, "n": of["ise"].n}
+        | {f"{metric}_{part}": getattr(of[metric], part) for metric, part in columns}
+        | {
+            "settling_min": settled if np.isfinite(settled) else float("nan"),
+            "steady_abs_error": Spread(score.steady_abs_error).mean,
+            "media_ml": Spread(trial.media(window)).mean,
+        }
+    )
 
 
 def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
@@ -85,32 +79,30 @@ ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
 
 def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     """List further values, an entry per row: the other convention, the noise-free OD, the floor, the effort."""
-    found = []
-    for trial in trials:
-        for window in windows(trial.schedule):
-            measured, clean, floor = (trial.score(window, of) for of in ("measured", "clean", "floor"))
-            found.append(
-                trial.names()
-                | {
-                    "window": window.label,
-                    "window_min": window.end - window.start,
-                    "ise_per_window": Spread(measured.ise_mean).mean,
-                    "itae_per_window": Spread(measured.itae_mean).mean,
-                    "clean_ise": Spread(clean.ise).mean,
-                    "clean_itae": Spread(clean.itae).mean,
-                    "clean_abs_error": Spread(clean.abs_error).mean,
-                    "floor_ise": Spread(floor.ise).mean,
-                    "floor_itae": Spread(floor.itae).mean,
-                    "effort_ul_s": Spread(trial.effort(window)).mean,
-                    "settled": int(np.isfinite(measured.settling_min).sum()),
-                    "overflowed": int(trial.overflowed.sum()),
-                }
-            )
-    return found
+    return [_detail(trial, window) for trial in trials for window in windows(trial.schedule)]
+
+
+def _detail(trial: DensityTrial, window: Window) -> dict[str, Any]:
+    measured, clean, floor = (trial.score(window, of) for of in ("measured", "clean", "floor"))
+    means = {
+        "ise_per_window": measured.ise_mean,
+        "itae_per_window": measured.itae_mean,
+        "clean_ise": clean.ise,
+        "clean_itae": clean.itae,
+        "clean_abs_error": clean.abs_error,
+        "floor_ise": floor.ise,
+        "floor_itae": floor.itae,
+        "effort_ul_s": trial.effort(window),
+    }
+    return (
+        trial.names()
+        | {"window": window.label, "window_min": window.end - window.start}
+        | {key: Spread(values).mean for key, values in means.items()}
+        | {"settled": int(np.isfinite(measured.settling_min).sum()), "overflowed": int(trial.overflowed.sum())}
+    )
 
 
 def _total(trial: DensityTrial, metric: str, of: str = "measured") -> Array:
-    """Sum a metric over the windows of a trial, (N,)."""
     each = [getattr(trial.score(window, of), metric) for window in windows(trial.schedule)]
     return np.asarray(np.sum(each, axis=0))
 
@@ -154,12 +146,6 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
     }
 
 
-def _partners(trials: Sequence[T], against: str) -> list[tuple[T, T]]:
-    """Return every trial with the trial of `against` on the same vials."""
-    of = {t.cell.vials: t for t in trials if t.cell.controller == against}
-    return [(t, of[t.cell.vials]) for t in trials if t.cell.controller != against and t.cell.vials in of]
-
-
 Scored = list[tuple[str, str, Array]]
 """Window, metric and its value in each replicate, (N,)."""
 
@@ -175,23 +161,20 @@ SCORES: dict[str, Callable[[Any], Scored]] = {
 """Signal -> what laws are compared by, reactor by reactor; a guest adds its own."""
 
 
-def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
-    """Compare every controller with `against` on the same vials, window by window.
+def pairs(trials: Sequence[Trial], against: str, scores: Callable[[Any], Scored] | None = None) -> list[dict[str, Any]]:
+    """Compare every controller with `against` on the same vials, window by window, or by other scores.
 
     Returns: mean difference over replicates with its 95 % interval, and the number of replicates in which it is lower.
     """
     found = []
-    for one, other in _partners(trials, against):
-        scores = SCORES[one.cell.signal]
-        for (window, metric, mine), (_, _, theirs) in zip(scores(one), scores(other), strict=True):
+    of = {t.cell.vials: t for t in trials if t.cell.controller == against}
+    met = [(t, of[t.cell.vials]) for t in trials if t.cell.controller != against and t.cell.vials in of]
+    for one, other in met:
+        of_one, of_other = map(scores or SCORES[one.cell.signal], (one, other))
+        for (window, metric, mine), (_, _, theirs) in zip(of_one, of_other, strict=True):
             found.append(_pair(one, other, metric, window, mine, theirs))
     return found
 
 
-def total_pairs(trials: Sequence[DensityTrial], against: str) -> list[dict[str, Any]]:
-    """Compare as `pairs`, for the sums over windows."""
-    return [
-        _pair(one, other, metric, "all", _total(one, metric), _total(other, metric))
-        for one, other in _partners(trials, against)
-        for metric in METRICS
-    ]
+def total_scores(trial: DensityTrial) -> Scored:
+    return [("all", metric, _total(trial, metric)) for metric in METRICS]

@@ -158,7 +158,9 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
         "paired": [
             p for key, names in AGAINST.items() for name in names for p in statistics.pairs(of_signal[key], name)
         ],
-        "paired_totals": [p for name in AGAINST["density"] for p in statistics.total_pairs(ordered, name)],
+        "paired_totals": [
+            p for name in AGAINST["density"] for p in statistics.pairs(ordered, name, statistics.total_scores)
+        ],
         "replicates": config.replicates,
         "seed": config.seed,
     }

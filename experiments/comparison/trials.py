@@ -9,10 +9,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -248,7 +248,6 @@ Followed = tuple[Policy, EstimateBounds | None]
 
 
 def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
-    """Run a trial of a density controller behind an interlock."""
     policy, bounds = followed or (None, None)
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
@@ -267,7 +266,7 @@ def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
     return RUNS[cell.signal](config, cell, followed)
 
 
-class Loops:
+class Loops(ExitStack):
     """Runner of cells in separate processes, one per core, from `start` on.
 
     Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
@@ -275,10 +274,11 @@ class Loops:
     """
 
     def __init__(self, config: BenchmarkConfig) -> None:
+        super().__init__()
         self.config = config
         self._waiting: dict[Cell, Followed | None] = {}
         self._running: dict[Future[Trial], Cell] = {}
-        self._pool = Workers(config.workers) if config.workers != 1 else None
+        self._pool = self.enter_context(Workers(config.workers)) if config.workers != 1 else None
 
     def start(self, cells: Sequence[Cell], followed: Followed | None = None) -> None:
         """Queue cells that all follow one policy, or none."""
@@ -306,12 +306,3 @@ class Loops:
                 if bar.disable and (k % max(total // 10, 1) == 0 or k == total):
                     log.info("closed loop %d of %d: %s, %s, %s", k, total, cell.scenario, cell.plant, cell.controller)
         return trials
-
-    def __enter__(self) -> Loops:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._pool is not None:
-            self._pool.__exit__(kind, error, trace)

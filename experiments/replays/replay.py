@@ -41,7 +41,6 @@ class _Recorded(Watched):
         return Measurement(60.0 * self._series.time[one], od, self._temperature[one], np.ones(1, dtype=np.bool_))
 
     def elapsed(self) -> float:
-        """Time of the reading, s."""
         return float(60.0 * self._series.time[max(self._k, 0)])
 
 

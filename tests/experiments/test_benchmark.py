@@ -221,8 +221,8 @@ def test_paper_is_all_recipes_and_each_loop_runs_once():
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
-        (f"{STEPS}.plants=[moon]", ["plants: moon", "nominal, "]),
-        (f"{STEPS}.controllers=[pid]", ["controllers: pid", "dqn, dqn_paper, dqn_adaptive, inverse, pi"]),
+        (f"{STEPS}.plants=[moon]", ["plants = moon", "nominal, "]),
+        (f"{STEPS}.controllers=[pid]", ["controllers = pid", "dqn, dqn_paper, dqn_adaptive, inverse, pi"]),
         ("comparison studies.comparison.plants=[twin]", ["twin (with plant_file=FILE)"]),
         ("comparison plant_file=a.yaml", ["plant_file = a.yaml", "studies.NAME.plants=[nominal,twin]"]),
     ],

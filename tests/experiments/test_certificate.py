@@ -569,18 +569,18 @@ MORE = replace(
 
 def test_whatever_is_asked_less_of_is_named_alone_and_what_is_asked_more_of_is_not() -> None:
     """A limit of safety is a reason to refuse, one of performance is told; the attack's share is a least one."""
-    assert CertifyConfig().laxer() == CertifyConfig().laxer_performance() == []
-    assert MORE.laxer() == MORE.laxer_performance() == []
+    assert CertifyConfig().laxer() == CertifyConfig().laxer_limits(safety=False) == []
+    assert MORE.laxer() == MORE.laxer_limits(safety=False) == []
     for name, values in ATTACKED_BY_LESS.items():
         for value in values:
             (named,) = replace(MORE, **{name: value}).laxer()
             shown = list(value) if isinstance(value, tuple) else value
             assert named.startswith(f"{name} = {shown}, ")
-            assert replace(MORE, **{name: value}).laxer_performance() == []
+            assert replace(MORE, **{name: value}).laxer_limits(safety=False) == []
     for f in fields(Limits):
         own = getattr(Limits(), f.name) * (0.9 if f.name.startswith("reached") else 1.1)
         config = replace(MORE, limits=replace(MORE.limits, **{f.name: own}))
-        named, other = config.laxer(), config.laxer_performance()
+        named, other = config.laxer(), config.laxer_limits(safety=False)
         named, other = (named, other) if f.name.startswith("safe_") else (other, named)
         assert (len(named), other) == (1, [])
         assert named[0].startswith(f"limits.{f.name} = {own}, ")

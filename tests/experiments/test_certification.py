@@ -12,13 +12,20 @@ import pytest
 
 from dqn.policy import Policy
 from envs.task import EnvConfig
-from experiments.certification.boxes import contradictions, on_lines, possible
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Pieces, drops, images, points_in_strips
 from experiments.certification.judge import SAFETY, _count, _required, _worst, certify, recheck
-from experiments.certification.network import Network, q_values, rounding
-from experiments.certification.od_loop import OdCase, OdLoop
-from experiments.certification.polygons import Regions, area, partition
+from experiments.certification.loops import OdCase, OdLoop
+from experiments.certification.polygons import (
+    Array,
+    Network,
+    Regions,
+    area,
+    contradictions,
+    partition,
+    possible,
+    rounding,
+)
 from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import Proof, attacked, dose_below, physical, prove
 from tests.experiments import laws, proofs
@@ -29,6 +36,15 @@ BOX = ((-0.02, 1.52), (0.4, 0.8))
 FAST = CertifyConfig(trajectories=0)
 proven = partial(proofs.proven, config=FAST)
 LARGEST = 0.06  # what the full pump takes off ln x in a minute: 0.02 / (1/3)
+
+
+def q_values(network: Network, points: Array) -> Array:
+    """Q of points (N, 2) in double precision, shape (N, A)."""
+    h = points
+    for weight, bias in network.hidden:
+        h = np.maximum(h @ weight + bias, 0.0)
+    weight, bias = network.output
+    return np.asarray(h @ weight + bias)
 
 
 def inside(regions: Regions, point: Any) -> set[int]:
@@ -120,22 +136,6 @@ def test_the_bound_of_a_box_by_hand(low: float, high: float, other: float, allow
     assert possible(network, np.array([[low, 0.4]]), np.array([[high, 0.8]])).tolist() == [allowed]
 
 
-@pytest.mark.parametrize("seed", [3, 6, 8])
-def test_a_line_knows_every_action_that_is_chosen_along_it_and_hardly_another(seed: int) -> None:
-    """A network that bends in both of its hidden layers, at 20 000 readings of two setpoints."""
-    policy, setpoints, x = laws.random(seed), np.array([0.47, 0.71]), np.linspace(-0.02, 1.52, 20_000)
-    points, action = on_lines(Network.of(policy), BOX[0], setpoints)
-    ends, line = points.x.reshape(-1, 2), points.strip[::2]
-    assert np.unique(action).size > 1
-    for n, setpoint in enumerate(setpoints):
-        chosen = policy.act(np.stack([x, np.full_like(x, setpoint)], axis=1))
-        mine = line == n
-        holds = (ends[mine, :1] <= x) & (x <= ends[mine, 1:])
-        assert (holds & (action[mine, None] == chosen)).any(axis=0).all()
-        assert holds.sum(axis=0).mean() < 1.001
-        np.testing.assert_array_equal(points.y[points.strip == n], setpoint)
-
-
 def test_a_map_that_leaves_its_start_has_no_band() -> None:
     whole = Pieces(np.array([[-9.0]]), np.array([[9.0]]), np.array([[0]]))
     band = images(whole, np.array([[[0.1, 0.1]]]), np.array([[-1.0, 1.0]]))
@@ -214,7 +214,8 @@ def test_entry_is_the_time_of_the_slowest_simulated_culture_into_what_is_allowed
     """
     one = OdLoop(mu, tau, 1.0, laws.RATES, (0.05, 1.5), np.array([r]), np.array([r]))
     policy, case = laws.law(share=mu * tau / 0.02, gain=40.0), OdCase("", 0.0, 0.0)
-    proof = prove(one, *on_lines(Network.of(policy), (-0.02, 1.6), one.low), case, 0.012)
+    wider = partition(Network.of(policy), ((-0.02, 1.6), (r - 0.01, r + 0.01)))[1]
+    proof = prove(one, points_in_strips(wider, one.low, one.low), wider.action, case, 0.012)
     allowed = 0.012 + proof.law_half_width[0]
     x, pumped, last, alone = np.array([0.05, 1.5]), np.array([0.05, 1.5]), 0, 1
     for period in range(1, 1000):
@@ -256,7 +257,7 @@ def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() ->
     every, law, policy = np.ones(3, dtype=bool), np.array([0.1, 0.2, 0.3]), np.array([0.125, 0.1875, 0.75])
     untils = [Mock(return_value=np.array(periods)) for periods in ([5.0, 7.0, np.inf], [3.0, np.inf, 2.0])]
     ends, bands = np.array([[-0.6, 0.6], [-0.7, 0.7], [-0.8, 0.8]]), (SimpleNamespace(until=each) for each in untils)
-    proof = Proof(None, every, *bands, policy, law, 0.5, ends, np.ones(3), every)
+    proof = Proof(None, every, *bands, policy, law, ends, np.ones(3), every)
     assert proof.later.tolist() == [2.0, 7.0, np.inf]
     for until in untils:
         np.testing.assert_allclose(until.call_args.args, ends.T)
@@ -348,19 +349,6 @@ def test_a_band_is_as_wide_as_its_farther_end() -> None:
     ends = np.array([[-0.2, 0.15], [-0.1, 0.15], [-0.1, 0.1], [-0.5, 0.0]])
     found = [float(strips.half_width(low, high)[0]) for low, high in ends[:, :, None]]
     assert found == pytest.approx([0.6 * 0.181269, 0.6 * 0.161834, 0.6 * 0.105171, 0.6 * 0.393469], abs=1e-6)
-
-
-def test_lines_and_polygons_prove_the_same() -> None:
-    policy, asked = laws.random(8), question(laws.random(8), FAST)
-    network, r = Network.of(policy), np.array([0.47, 0.6, 0.71])
-    narrow = asked.loop.at(r)
-    _, wider = partition(network, asked.box)
-    for case in asked.cases:
-        first = prove(narrow, points_in_strips(wider, narrow.low, narrow.high), wider.action, case)
-        second = prove(narrow, *on_lines(network, asked.box[0], r), case)
-        np.testing.assert_array_equal(first.band.invariant, second.band.invariant)
-        np.testing.assert_allclose(first.half_width, second.half_width, atol=1e-4)
-        np.testing.assert_array_equal(first.grows, second.grows)
 
 
 def test_the_law_passes_and_no_trajectory_leaves_its_band() -> None:
@@ -478,9 +466,10 @@ def test_what_the_pump_cannot_hold_is_said_and_not_judged() -> None:
     assert str(lost.checks[1]) == "nominal: strips that the pump cannot hold: 80, allowed 0 (setpoint 0.4 to 0.8)"
 
 
-def test_a_line_finds_what_a_setpoint_fails() -> None:
-    assert recheck(laws.law(), FAST, [0.4, 0.65, 0.8]) == []
-    failed = recheck(laws.spike(), FAST, [0.5, laws.SPIKE])
+def test_a_setpoint_alone_finds_what_it_fails() -> None:
+    """Also at the ends of the range, and beyond them by the rounding of a setpoint."""
+    assert recheck(laws.law(), FAST, [0.4 - 1e-10, 0.65, 0.8 + 1e-10]) == []
+    failed = recheck(laws.spike(), FAST, [laws.SPIKE])
     assert failed
     assert all("0.5235" in check.where for check in failed)
 

@@ -17,9 +17,9 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Band, Pieces, images
 from experiments.certification.judge import certify, recheck
-from experiments.certification.network import Array
+from experiments.certification.loops import ShareCase, ShareLoop
+from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, question
-from experiments.certification.share_loop import ShareCase, ShareLoop
 from tests.experiments import laws, proofs
 
 pytestmark = pytest.mark.numeric

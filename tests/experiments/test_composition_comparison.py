@@ -294,7 +294,7 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        ("studies.composition.compositions=[pid]", "studies.composition.compositions: pid is none of"),
+        ("studies.composition.compositions=[pid]", "studies.composition.compositions = pid: allowed"),
         (f"{PI} studies.c.plants=[nominal] {STEPS}", "studies.c.plants = nominal: allowed those with two species"),
         (f"{PI} {TWO} studies.c.scenarios=[day]", "studies.c.scenarios = day: allowed those with ratios"),
         (f"+experiment=comparison {PI}", "all with compositions, or none"),

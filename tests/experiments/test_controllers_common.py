@@ -17,8 +17,7 @@ from experiments.laws import registry
 from experiments.laws.base import Accounts, Array, Controller, Explains, Watches
 from experiments.laws.density import baselines
 from experiments.laws.density.learned import LearnedController, settings
-from experiments.laws.density.mpc import MpcConfig
-from experiments.laws.density.pso import SwarmConfig
+from experiments.laws.density.mpc import MpcConfig, SwarmConfig
 from tests.experiments import laws
 
 pytestmark = pytest.mark.numeric

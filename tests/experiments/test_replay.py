@@ -17,7 +17,7 @@ from experiments import replay as command
 from experiments.laws import registry
 from experiments.laws.base import Controller
 from experiments.loop.loop import ClosedLoop
-from experiments.replays.config import ReplayConfig
+from experiments.replay import ReplayConfig
 from experiments.replays.replay import replay
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock

@@ -14,7 +14,7 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.comparison import statistics
-from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_pairs, totals
+from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_scores, totals
 from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, run_trial, windows
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.signals import Density, within_2sd
@@ -148,10 +148,10 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert late["percent"] == pytest.approx(100.0 * (0.45 / 0.76 - 1.0))
     assert (late["n"], late["verdict"], late["plant"], late["scenario"]) == (3, "lower", "quiet", "steps")
     assert late["ci95"] == pytest.approx(Spread(450.0 * np.array([-0.1, -0.1, -0.11])).ci95)
-    whole = total_pairs([mine, theirs], "pi")
+    whole = pairs([mine, theirs], "pi", total_scores)
     assert [(p["window"], p["metric"]) for p in whole] == [("all", "ise"), ("all", "itae")]
     assert whole[1]["difference"] == pytest.approx(650.0 * (0.15 - 0.76 / 3.0))
-    assert total_pairs([mine, theirs], "mpc")[1]["verdict"] == "higher"
+    assert pairs([mine, theirs], "mpc", total_scores)[1]["verdict"] == "higher"
     same = pairs([replace(theirs, cell=Cell("dqn", "quiet", "steps")), theirs], "pi")
     assert {p["verdict"] for p in same} == {"no difference shown"}
     small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")

@@ -32,11 +32,9 @@ class Threshold:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self._on: Mask = np.zeros(n, dtype=bool)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         now = usable(od, rows)
         stay = self._on & (od > setpoint - self.config.hysteresis)
         self._on = np.where(now, (od > setpoint) | stay, self._on)
@@ -84,15 +82,12 @@ class GainScheduled:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self._degc, self._rate = np.full(n, self.config.temperatures[-1]), np.zeros(n)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `Watches.watch`."""
         self._degc = np.where(rows & np.isfinite(temperature), temperature, self._degc)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         now, table = usable(od, rows), self.config
         mu, gain = (np.interp(self._degc, table.temperatures, column) for column in (table.mu, table.gain))
         z = np.log(np.maximum(np.where(now, od, 1.0), LOWEST_OD) / np.maximum(setpoint, LOWEST_OD))
@@ -119,9 +114,7 @@ class Hold:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self._n = n
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         return np.full(self._n, self.rate)

@@ -122,7 +122,6 @@ class Estimator:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """Forget everything; N rows."""
         c, mu = self.config, self.model.mu
         self.mean = np.tile([0.0, mu, 1.0, c.warmth * mu], (n, 1))
         self.cov = np.tile(np.diag([0.0, c.mu_sd**2, c.gain_sd**2, (c.warmth_sd * mu) ** 2]), (n, 1, 1))
@@ -135,7 +134,6 @@ class Estimator:
         self._squares = np.full((n, FIXED.long), np.nan)  # squares of the newest of them
 
     def dosed(self, volume_ml: Array) -> None:
-        """Take the volume delivered since the last call, mL, (N,)."""
         if self.config.told:
             self._given_ml, self._heard = volume_ml + (self._given_ml if self._heard else 0.0), True
 
@@ -273,12 +271,10 @@ class Estimator:
 
     @property
     def loud(self) -> NDArray[np.bool_]:
-        """Whether that is impossible for a right filter, (N,)."""
         return np.asarray(self.loudness > FIXED.loud)
 
     @property
     def quiet(self) -> NDArray[np.bool_]:
-        """Whether innovations have been far smaller for a long time, (N,)."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self._squares.mean(axis=1) < FIXED.quiet)
 

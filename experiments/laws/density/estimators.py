@@ -127,25 +127,21 @@ class WithEstimator:
         self.remembers = ("law", "estimator") if isinstance(law, Remembers) else ("estimator",)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self.law.reset(n)
         self.estimator.reset(n)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `Watches.watch`."""
         self.estimator.watch(od, temperature, minute, rows)
         if isinstance(self.law, Watches):
             self.law.watch(od, temperature, minute, rows)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act` of the controller."""
         self.estimator.see(od, minute, rows)
         rate = self.law.act(od, setpoint, minute, rows)
         self.estimator.decided(rate)
         return rate
 
     def dosed(self, volume_ml: Array) -> None:
-        """See `Accounts.dosed`."""
         self.estimator.dosed(volume_ml)
         if isinstance(self.law, Accounts):
             self.law.dosed(volume_ml)

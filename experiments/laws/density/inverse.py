@@ -47,16 +47,13 @@ class Inverse:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self.estimator.reset(n)
         self._rate = np.zeros(n)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `Watches.watch`."""
         self.estimator.watch(od, temperature, minute, rows)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         self.estimator.see(od, minute, rows)
         error, share = self.estimator.relative(setpoint)
         wanted = np.clip(error + share, 0.0, 1.0)
@@ -68,9 +65,7 @@ class Inverse:
         return self._rate.copy()
 
     def dosed(self, volume_ml: Array) -> None:
-        """See `Accounts.dosed`."""
         self.estimator.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """See `Estimator.explain`."""
         return self.estimator.explain()

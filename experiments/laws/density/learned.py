@@ -120,7 +120,6 @@ class RelativeController:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self.estimator.reset(n)
         self.second.reset(n)
         self._rate, self._q = np.zeros(n), np.full((n, self.policy.actions.size), np.nan)
@@ -128,12 +127,10 @@ class RelativeController:
         self._supervised, self._alarm, self._noted = np.zeros((3, n), dtype=np.bool_)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """See `Watches.watch`."""
         for each in (self.estimator, self.second):
             each.watch(od, temperature, minute, rows)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         for each in (self.estimator, self.second):
             each.see(od, minute, rows)
         now = usable(od, rows)
@@ -164,7 +161,6 @@ class RelativeController:
         return ~self.bounds.hold(od, error, shown, np.maximum(largest - shown, shown - least))
 
     def dosed(self, volume_ml: Array) -> None:
-        """See `Accounts.dosed`."""
         for each in (self.estimator, self.second):
             each.dosed(volume_ml)
 

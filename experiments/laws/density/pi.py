@@ -45,14 +45,12 @@ class ChiBioPI:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self._cycles = np.zeros(n, dtype=np.int64)
         self._before = np.zeros(n)
         self._times = np.zeros((2, n))  # of the last two recorded cycles, older first
         self._p, self._i1, self._i2, self._rate = (np.zeros(n) for _ in range(4))
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         now = usable(od, rows)
         self._cycles = self._cycles + now
         regulating = now & (self._cycles >= 3)
@@ -117,12 +115,10 @@ class TunedPI:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`."""
         self._integral = np.full(n, self.model.mu if self.config.feed_forward else 0.0)
         self._p, self._rate = np.zeros(n), np.zeros(n)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`."""
         now = usable(od, rows)
         z = np.log(np.maximum(np.where(now, od, 1.0), LOWEST_OD) / np.maximum(setpoint, LOWEST_OD))
         p = self.gain * z
