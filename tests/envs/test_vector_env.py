@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 import envs  # registers the environment
 from envs.gym_adapter import REGISTERED
+from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from envs.vector_env import BioreactorVectorEnv
 
@@ -26,6 +27,18 @@ def test_make_vec_gives_the_native_environment():
     env = gymnasium.make_vec(ID, num_envs=3)
     assert isinstance(env.unwrapped, BioreactorVectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+def test_the_optimums_actions_in_info_cost_what_the_optimum_costs():
+    env = gymnasium.make(ID, optimum=True, episode_steps=20)
+    _, info = env.reset(seed=3)
+    best, total, over = solve_episode(env.unwrapped.config, info["setpoint"]), 0.0, False
+    ods, _ = best.rollout(np.array([info["od"]]))
+    while not over:
+        assert info["optimal_rate"] == env.unwrapped.config.pump_rates()[info["optimal_action"]]
+        _, reward, _, over, info = env.step(info["optimal_action"])
+        total += reward
+    assert total == pytest.approx(-np.sum((ods[:, 0] - best.setpoint) ** 2))
 
 
 def pair(n, mode, **overrides):
