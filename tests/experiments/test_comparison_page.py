@@ -237,7 +237,7 @@ def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate
     out = section()
     page.SECTIONS["share"].add(out, {"rows": rows, "paired": paired, "figures": []}, tmp_path)
     tables = {table.name: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
-    two = ("law", "one", "two")
+    two = ("controller", "one", "two")
     assert tables.pop("steps_ratio_abs_error_mean") == (two, [("pi", "0.01", "–"), ("midpoint", "0.02", "0.03")])
     assert tables.pop("steps_ratio_abs_error_last2h") == (two, [("pi", "0.02", "–"), ("midpoint", "0.04", "0.06")])
     assert tables.pop("steps_estimate") == (two, [("pi", "0.03, 9 %", "–"), ("midpoint", "0.06, 18 %", "0.09, 27 %")])
@@ -245,7 +245,7 @@ def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate
     assert tables.pop("steps_od") == (two, density)
     assert tables.pop("steps_paired")[1] == [("midpoint", "+0.0100 [-0.0020, +0.0300], lower in 1 of 3")]
     assert tables.pop("sine_paired")[1] == [("midpoint", "-0.0200, lower in 3 of 3")]
-    assert tables.pop("sine_ratio_abs_error_mean") == (("law", "one"), [("pi", "0.04")])
+    assert tables.pop("sine_ratio_abs_error_mean") == (("controller", "one"), [("pi", "0.04")])
     assert set(tables) == {"sine_ratio_abs_error_last2h", "sine_estimate", "sine_od"}
     assert [heading for heading, _ in out.sections[1:]] == ["steps", "sine"]
 
@@ -264,6 +264,12 @@ def test_published_values_that_no_law_can_reach_on_the_model_are_named_with_the_
     assert "pi at" not in said
     for none in ({"ise_mean": 0.034}, {"plant": "bench"}):
         assert page._below_bound({"rows": [oracle | none]}) == ""
+
+
+def test_the_lowest_of_all_controllers_but_the_oracle_is_marked() -> None:
+    rows = [paper_row(law, "setpoint_steps", "0.8", k) for k, law in enumerate(("oracle", "mine", "pi", "mpc"), 1)]
+    [row] = page.table_2(rows, "ise").rows
+    assert [str(cell)[0] for cell in row[4:] if isinstance(cell, page.Emphasis)] == ["2"]
 
 
 def test_agents_are_told_apart_by_what_differs_and_each_by_its_own_regrets(tmp_path: Path) -> None:
