@@ -1,16 +1,17 @@
 """The single-environment view of the vector environment, for libraries that expect `gymnasium.Env`."""
 
-from functools import cache, partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv
+from envs.vector_env import EpisodeSpec, EpisodeVectorEnv
+
+__all__ = ["EpisodeEnv", "register"]
 
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
-    "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
+    "Bioreactor-v0": ("envs.density:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
     "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
 }
@@ -64,29 +65,6 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
             self._next, observation = observation[0], infos["final_obs"]
             info = dict(zip(self._batch.names, observation[0].tolist(), strict=False))
         return observation[0], float(reward[0]), False, bool(truncated[0]), info
-
-
-class BioreactorEnv(EpisodeEnv):
-    """`BioreactorVectorEnv` as one environment. Version history: v0, the task of the paper.
-
-    Args: optimum: `info` also has the exact optimum's "optimal_action" and its "optimal_rate", mL/s.
-    """
-
-    batch = BioreactorVectorEnv
-
-    def __init__(self, config: Any = None, *, optimum: bool = False, **given: Any) -> None:
-        from envs.optimum import solve_episode  # which needs this module
-
-        super().__init__(config, **given)
-        self._optimum = cache(partial(solve_episode, self.config)) if optimum else None
-
-    def _info(self) -> dict[str, Any]:
-        info = super()._info()
-        if self._optimum is not None:
-            left = self.config.episode_steps - self._batch._steps[0]
-            best = self._optimum(info["setpoint"]).act(self._batch.state[:, 0], left)
-            info |= {"optimal_action": int(best[0]), "optimal_rate": float(self.config.pump_rates()[best[0]])}
-        return info
 
 
 def register() -> None:

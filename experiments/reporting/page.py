@@ -224,7 +224,7 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     """
     name = folder.resolve()
     title = next((c for c in map(_command, (name, *name.parents)) if c[:1].isalpha()), "Run")
-    page = Page(title, f"{name.parent.name}/{name.name}, {PACKAGE} {_version()}")
+    page = Page(title, f"{name.parent.name}/{name.name}, {version()}")
     labels = {_command(run) if run != folder else "": run for run in runs}
     if len(labels) < len(runs):
         labels = {run.name: run for run in runs}
