@@ -19,6 +19,7 @@ from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
+SHORT = 6  # values of a preset; longer ones stand in its file
 SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
@@ -50,7 +51,7 @@ def page() -> str:
         lines += [*_settings(command.schema, parts), ""]
     lines += ["## Parts", ""]
     for kind, name in parts.items():
-        said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
+        said = (kind.__doc__ or "").split("\n\n")[0].split("Raises:")[0].strip().replace("\n    ", " ")
         base = next((of for of in kind.__mro__[1:] if of in parts), None)
         start = [f"As [{parts[base]}](#{_anchor(parts[base])}), except:", ""] if base else []
         own = [line for line in _settings(kind(), parts) if not base or line not in _settings(base(), parts)]
@@ -58,7 +59,7 @@ def page() -> str:
     lines += [
         "## Presets",
         "",
-        "Each with what differs from the defaults or from the preset in brackets.",
+        "Each with what differs from the defaults or from the preset in brackets, or with the file that has it.",
         "",
     ]
     for group, options in groups().items():
@@ -115,7 +116,8 @@ def _preset(group: str, option: str) -> str:
     """Write what a preset is, the preset it starts from, and the values of its own file."""
     own = yaml.safe_load((ROOT / f"{group}/{option}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
-    changed = " ".join(f"{key}={shown(value)}" for key, value in flat(own) if (key, value) != ("kind", option))
+    values = [f"{key}={shown(value)}" for key, value in flat(own) if (key, value) != ("kind", option)]
+    changed = " ".join(values) if len(values) <= SHORT else f"conf/{group}/{option}.yaml"
     said = ": ".join([*owners(f"{group}/{option}")[:1], sentence(f"{group}/{option}")])
     return f"- `{option}`{start and f' (as {start})'}: {said}{changed and f' `{changed}`'}"
 

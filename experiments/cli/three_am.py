@@ -29,12 +29,9 @@ def _sort(kind: type[Message]) -> str:
 
 
 def _lines(what: str, room: str) -> str:
-    """Write a line per message; those that need no action, and say all that there is to say, in one line at the end."""
-    worded = [one for one in declared(what, room) if what == "alarms" or re.search(r"\w", _shown(one.says))]
-    plain = [one for one in worded if what == "notes" and not (_meaning(one) or one.remedy)]
-    lines = [_line(one) for one in worded if one not in plain]
-    lines += ["- No action is needed after " + ", ".join(f"`{_shown(one.says)}`" for one in plain)] if plain else []
-    return "\n" + "\n".join(lines) + "\n"
+    """Write a line per message; an error or note that says all and needs no action has none."""
+    told = [one for one in declared(what, room) if what == "alarms" or _meaning(one) or one.remedy]
+    return "\n" + "\n".join(_line(one) for one in told if what == "alarms" or re.search(r"\w", _shown(one.says))) + "\n"
 
 
 def _line(kind: type[Message]) -> str:
