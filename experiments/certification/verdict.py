@@ -20,7 +20,12 @@ TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities of a change of side, for each qua
 
 
 class Loop(Protocol):
-    """A family of closed loops with a scalar state, one per strip; cases are disturbances."""
+    """A family of closed loops with a scalar state, one per strip; cases are disturbances.
+
+    low, high: strips. growth: of the state without a dose. shift: by each action. range: of starts. seen: readings of a
+    state. states: in which an action is possible. law: the one-line controller. half_width, within: of a band.
+    key: cases with equal images. in_od: a half-width in OD. attack: a step with the worst errors.
+    """
 
     low: Array
     high: Array

@@ -1,4 +1,4 @@
-"""What a law of the composition is told and what it answers: N cultures in, N thermostat targets out."""
+"""What a composition controller gets and returns: N cultures in, N thermostat targets out."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -16,7 +16,7 @@ SHARE = "share"
 """The signal, by which its laws are known."""
 SEEN = ("logit_share", "temperature", "rate", "logit_setpoint")
 SEEN_AHEAD = (*SEEN, "logit_next", "minutes_to_change")
-"""What a learned law sees (envs/coculture/task.py), and where changes are announced; it answers with degC."""
+"""Observation of a learned controller (envs/coculture/task.py), and with announced changes; it returns degC."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""A learned policy as a law of the composition."""
+"""A learned policy as a composition controller."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ __all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
 class LearnedLawConfig(LawConfig):
     """The policy that sees no change before it comes."""
 
-    kind: str = setting("dqn", "which law of the composition")
+    kind: str = setting("dqn", "composition controller")
     control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
@@ -26,7 +26,7 @@ class LearnedLawConfig(LawConfig):
 class PreviewLawConfig(LearnedLawConfig):
     """The policy to which changes are announced."""
 
-    kind: str = setting("dqn_preview", "which law of the composition")
+    kind: str = setting("dqn_preview", "composition controller")
     control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 

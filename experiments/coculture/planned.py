@@ -32,7 +32,7 @@ def _best(model: CocultureConfig, value: Array | None, estimate: ShareEstimate, 
 class RecedingConfig(LawConfig):
     """How far it plans."""
 
-    kind: str = setting("receding", "which law of the composition")
+    kind: str = setting("receding", "composition controller")
     control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
     horizon_min: float = setting(360.0, "how far ahead it plans", "min", within=(1, 1440))
 
@@ -63,7 +63,7 @@ class Receding(Periodic[RecedingConfig]):
 class OptimumConfig(LawConfig):
     """How often it decides."""
 
-    kind: str = setting("optimum", "which law of the composition")
+    kind: str = setting("optimum", "composition controller")
     control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
