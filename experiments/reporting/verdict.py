@@ -129,7 +129,7 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
 
 def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
     checks: Sequence[Any] = summary["checks"]
-    claim = f"Certificate of a policy whose inputs are {' and '.join(summary['observation'])}."
+    claim = f"Certificate of a policy for {', '.join(summary['observation'])}."
     unsafe = not all(check["holds"] for check in checks if check["kind"] == "safety")
     failed = [check["name"] for check in sorted(checks, key=lambda c: c["kind"] != "safety") if not check["holds"]]
     items = [f"{len(checks)} requirements were judged, listed below", *(f"fails: {name}" for name in failed[:SHOWN])]
