@@ -6,10 +6,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv
+from envs.vector_env import EpisodeSpec, EpisodeVectorEnv
+
+__all__ = ["EpisodeEnv", "register"]
 
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
-    "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
+    "Bioreactor-v0": ("envs.density:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
     "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
 }
@@ -61,14 +63,8 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         info = self._info()
         if truncated[0]:
             self._next, observation = observation[0], infos["final_obs"]
-            info = dict(zip(info, observation[0].tolist(), strict=True))
+            info = dict(zip(self._batch.names, observation[0].tolist(), strict=False))
         return observation[0], float(reward[0]), False, bool(truncated[0]), info
-
-
-class BioreactorEnv(EpisodeEnv):
-    """`BioreactorVectorEnv` as one environment. Version history: v0, the task of the paper."""
-
-    batch = BioreactorVectorEnv
 
 
 def register() -> None:

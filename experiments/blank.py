@@ -1,7 +1,7 @@
 """Measure the blank of clear medium under run conditions and store it: `python -m experiments.blank`."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from hardware.chibio.calibrations import save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
 from hardware.chibio.procedures import measure_blanks, warm_up
+from hardware.chibio.protocol import POSITIONS
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.errors import ReactorError
 
@@ -23,6 +24,7 @@ class BlankConfig:
     """Config of a blank measurement. Raises: ValueError with key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
+    reactor: str | None = setting(None, "reactor position; null: those of backend.reactors", choices=POSITIONS)
     warm_up: float = setting(90.0, "longest time for the medium to reach its temperature", "min", within=(0, 600))
     tolerance: float = setting(1.0, "largest difference to the thermostat's target", "degC", within=(0.2, 15))
     samples: int = setting(6, "number of averaged readings", "min", within=(3, 60), note="one a minute")
@@ -33,7 +35,7 @@ class BlankConfig:
 
 def blank(config: BlankConfig, folder: Path) -> None:
     """Stir clear medium, heat it, average its counts, set them as blanks, store them. Raises: UserError."""
-    backend = config.backend
+    backend = replace(config.backend, reactors=(config.reactor,)) if config.reactor else config.backend
     what = "clear medium in %s: to %g degC first, then %d minutes"
     log.info(what, ", ".join(backend.reactors), backend.temperature, config.samples + 1)
     with frame.refusing(ReactorError):

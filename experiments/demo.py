@@ -39,7 +39,8 @@ def commands(folder: Path) -> list[list[str]]:
         ["train", f"env_file={calibrated}", "stop_within=1", "seed=3", f"hydra.run.dir={folder / '2_train'}"],
         ["certify", f"policy={policy}", f"hydra.run.dir={folder / '3_certify'}"],
         [
-            "deploy", "backend=emulator", "backend.speed=0", "backend.reactors=[M0]", f"policy={policy}",
+            "deploy", "backend=emulator", "backend.speed=0", "backend.reactors=[M0]", "backend.plant=shipped",
+            f"policy={policy}",
             f"hydra.run.dir={folder / '4_deploy'}",
         ],
         ["report", f"run={folder}", f"hydra.run.dir={folder / '5_report'}"],

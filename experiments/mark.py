@@ -25,7 +25,7 @@ class MarkConfig:
     """Config of a mark: event, run, reactor and time."""
 
     run: str = setting("", "folder of a running or finished deployment, or `latest`")
-    reactor: str = setting("", "reactor; empty: all")
+    reactor: str = setting("", "reactor position or unit; '': all")
     text: str = setting("inoculated", "event, in one line of at most 80 characters")
     level_ml: float | None = setting(
         None, "volume read from the vial; sets the ledger of a running deployment, and the unit's own", "mL",

@@ -50,6 +50,7 @@ def write(folder: Path) -> Path:
     if not runs:
         raise frame.UserError(f"run={folder}: holds no summary.json; give the folder of a finished run")
     summaries = [_summary(run) for run in runs]
+    runs.sort(key=lambda run: not (run / "recordings").is_dir())  # what the others were for comes first
     compared = runs == [folder] and isinstance(summaries[0], dict) and "beside_paper" in summaries[0]
     try:
         return page.save(

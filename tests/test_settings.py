@@ -8,7 +8,7 @@ import importlib
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -26,10 +26,12 @@ ELSEWHERE = {  # not on the page: bases, and what the programs beside the comman
 }  # fmt: skip
 NUMBER = r"(-?(?:\d[\d.]*(?:e[-+]?\d+)?|inf))"
 
+LINE = re.compile(r"- \[?`(\w+)(?:=(.*?))?`(?:\]\(\S+\))?(?: ([^:(][^:]*?))?(?: \((.+?)\))?: (.+)")
+
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table: what the page says of one setting."""
+    """A line of the page: what the page says of one setting."""
 
     key: str
     default: str
@@ -83,14 +85,16 @@ def ranged(text: str) -> Range | None:
 
 
 def tables() -> dict[str, dict[str, Row]]:
-    """The tables of the page by heading, without those of the presets."""
+    """The lines of the page by heading, without those of the presets; first the lines of what a heading is as."""
     found: dict[str, dict[str, Row]] = {}
     for line in (ROOT / "docs" / "configuration.md").read_text("utf-8").partition("\n## Presets")[0].splitlines():
         if line.startswith("### "):
-            table = found.setdefault(line.removeprefix("### "), {})
-        elif line.startswith("| `"):
-            cells = [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-            table[cells[0].strip("`")] = Row(cells[0].strip("`"), *cells[1:])
+            heading = line.removeprefix("### ")
+        elif base := re.match(r"As \[(.+)\]\(", line):
+            found[heading] = dict(found[base[1]])
+        elif own := LINE.fullmatch(line):
+            key, default, unit, allowed, meaning = (group or "" for group in own.groups())
+            found.setdefault(heading, {})[key] = Row(key, default, unit, allowed, meaning)
     return found
 
 
@@ -111,9 +115,8 @@ TABLES, CONFIGS = tables(), configs()
 def table_of(config: type[Any]) -> str:
     """The heading under which a config stands: by its keys, and by its kind where several have the same."""
     default = {f.name: f.default for f in fields(config)}
-    kind = f"`{default['kind']}`" if default.get("kind", MISSING) is not MISSING else None
     alike = [name for name, rows in TABLES.items() if list(rows) == list(default)]
-    return next((name for name in alike if len(alike) == 1 or TABLES[name]["kind"].default == kind), "")
+    return next((name for name in alike if len(alike) == 1 or TABLES[name]["kind"].default == default["kind"]), "")
 
 
 def rows_of(config: type[Any]) -> list[Row]:
@@ -143,8 +146,8 @@ def test_default_unit_range_and_meaning_are_those_of_the_page(config: type[Any])
         assert (row.key, row.unit, row.meaning) == (entry.name, entry.said.unit, entry.said.what)
         assert row.allowed == entry.allowed
         assert row.meaning
-        if row.default and not row.default.startswith("["):  # a part has a table of its own
-            given = getattr(build(config(), {row.key: yaml.safe_load(row.default.strip("`"))}), row.key)
+        if row.default:  # a part has a section of its own
+            given = getattr(build(config(), {row.key: yaml.safe_load(row.default)}), row.key)
             assert given == entry.value or np.allclose(given, entry.value, rtol=1e-5, atol=0.0), row
 
 

@@ -109,7 +109,7 @@ def drifts(along: tuple[Segment, ...]) -> bool:
     """Tell whether tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
 
     Fluctuating growth is part of the model and mu its mean. The rule is stricter than that of a warning, because a
-    window must not drift (docs/records/calibration.md, The window, compares both rules).
+    window must not drift.
     """
     mu, tau = drift(along, [s.mu for s in along]), drift(along, [s.tau for s in along])
     return _steps([s.mu for s in along if s.mu is not None]) or any(

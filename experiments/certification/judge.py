@@ -196,7 +196,7 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
     yield _count("nominal: strips that the pump cannot hold", asked, ~proofs[0].holdable)
     if asked.median is not None:
         middle = float(np.median(np.nan_to_num(proofs[0].excess, nan=np.inf)))
-        title = f"nominal: median half-width over that of the law, safety, {asked.unit}"
+        title = f"nominal: median half-width over that of the one-line controller, safety, {asked.unit}"
         yield Requirement(title, middle, asked.median, f"all {asked.what}s")
     for proof in proofs:
         name, held = proof.case.name, proof.holdable
@@ -206,12 +206,12 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
         yield _count(f"{name}: strips whose band is not entered", asked, held & ~proof.band.entered)
         yield _count(f"{name}: strips in which a low culture may be washed out", asked, held & ~proof.grows)
         if name in asked.late:
-            title, value, limit = "entry after the law's, periods", proof.later, asked.late[name]
+            title, value, limit = "entry after the one-line controller's, periods", proof.later, asked.late[name]
         else:
             title, value, limit = "entry time over the pump's own", proof.entry, limits.entry
         yield _worst(f"{name}: {title}", asked, value, limit, held, PERFORMANCE)
         if name in asked.judged:
-            title = f"{name}: half-width over that of the law"
+            title = f"{name}: half-width over that of the one-line controller"
             yield _worst(f"{title}, {asked.unit}", asked, proof.excess, asked.margins[name], held, PERFORMANCE)
             yield _worst(f"{title}, safety, {asked.unit}", asked, proof.excess, asked.judged[name], held)
     title = "half of the largest dose below the setpoint"

@@ -17,9 +17,9 @@ from experiments.cli import extensions
 from experiments.cli.frame import EntryPoint
 from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
-from experiments.reporting.tables import markdown
 
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
+SHORT = 6  # values of a preset; longer ones stand in its file
 SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
@@ -31,7 +31,8 @@ them. After a change:
 A value is set by `key=value` and a preset is chosen by `group=preset`, in any order, after
 `python -m experiments.NAME`. `--help` prints a command's keys with the values that the rest of its line gives.
 `--cfg job` prints the resolved config, which every run keeps as `config.yaml` in its folder. A key that belongs to a
-part is written with the part's name before it: `bench.max_rate=0.01`.
+part is written with the part's name before it: `bench.max_rate=0.01`. Each line below has a key with its default, the
+unit, the allowed values in brackets, and the meaning.
 """
 
 
@@ -47,22 +48,23 @@ def page() -> str:
     for name, command in known.items():
         taken = ", ".join(f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name))
         lines += [f"### {name}", "", sentence(name), "", *((f"Groups: {taken}.", "") if taken else ())]
-        lines += _table(command.schema, parts)
+        lines += [*_settings(command.schema, parts), ""]
     lines += ["## Parts", ""]
     for kind, name in parts.items():
-        said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
-        lines += [f"### {name}", "", said, "", *_table(kind(), parts)]
-    lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
+        said = (kind.__doc__ or "").split("\n\n")[0].split("Raises:")[0].strip().replace("\n    ", " ")
+        base = next((of for of in kind.__mro__[1:] if of in parts), None)
+        start = [f"As [{parts[base]}](#{_anchor(parts[base])}), except:", ""] if base else []
+        own = [line for line in _settings(kind(), parts) if not base or line not in _settings(base(), parts)]
+        lines += [f"### {name}", "", said, "", *start, *own, ""]
+    lines += [
+        "## Presets",
+        "",
+        "Each with what differs from the defaults or from the preset in brackets, or with the file that has it.",
+        "",
+    ]
     for group, options in groups().items():
-        rows = [(f"`{option}`", _said(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
-        lines += [f"### Presets of {group}", "", markdown(("preset", "what it is", "what it changes"), rows)]
+        lines += [f"### Presets of {group}", "", *(_preset(group, option) for option in options), ""]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _said(name: str) -> str:
-    """Describe a preset; a recipe with the command that it is for."""
-    of = owners(name)
-    return f"{of[0]}: {sentence(name)}" if of else sentence(name)
 
 
 def _anchor(heading: str) -> str:
@@ -99,22 +101,25 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
     return cast(type[Any], of) if is_dataclass(of) else None
 
 
-def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
-    rows = []
+def _settings(config: Any, parts: dict[type[Any], str]) -> list[str]:
+    """Write a line per field; a part has a section of its own."""
+    lines = []
     for entry in entries(config):
         of = _part(config, entry)
-        own = parts[of] if of else ""
-        default = f"[{own}](#{_anchor(own)})" if own else f"`{shown(entry.value)}`"
-        cells = (f"`{entry.name}`", default, entry.said.unit, entry.allowed, entry.said.what)
-        rows.append([cell.replace("|", "\\|") for cell in cells])
-    return [markdown(("key", "default", "unit", "allowed", "meaning"), rows)] if rows else []
+        name = f"[`{entry.name}`](#{_anchor(parts[of])})" if of else f"`{entry.name}={shown(entry.value)}`"
+        allowed = entry.allowed and f"({entry.allowed})"
+        lines.append(f"- {' '.join(filter(None, (name, entry.said.unit, allowed)))}: {entry.said.what}")
+    return lines
 
 
-def _changes(name: str) -> str:
-    own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+def _preset(group: str, option: str) -> str:
+    """Write what a preset is, the preset it starts from, and the values of its own file."""
+    own = yaml.safe_load((ROOT / f"{group}/{option}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
-    changed = ", ".join(f"`{key}={shown(value)}`" for key, value in flat(own))
-    return "; ".join(filter(None, (start and f"as {start}", changed))) or "nothing"
+    values = [f"{key}={shown(value)}" for key, value in flat(own) if (key, value) != ("kind", option)]
+    changed = " ".join(values) if len(values) <= SHORT else f"conf/{group}/{option}.yaml"
+    said = ": ".join([*owners(f"{group}/{option}")[:1], sentence(f"{group}/{option}")])
+    return f"- `{option}`{start and f' (as {start})'}: {said}{changed and f' `{changed}`'}"
 
 
 if __name__ == "__main__":

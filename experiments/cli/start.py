@@ -9,13 +9,14 @@ from types import TracebackType
 
 PACKAGES = ("conf", "dqn", "envs", "hardware")
 HOME = Path(__file__).parents[2]  # folder of all packages of this project
+WINDOWS = "this program needs Linux or macOS; on Windows run it inside WSL (wsl --install)"
 
 
 def begin() -> None:
     """Refuse packages of other projects. Raises: SystemExit with one line for a command, ImportError for a library."""
     first = Path(sys.argv[0] if sys.argv else "").name
     command = first in ("-m", "turbidostat")  # the interpreter still searches the command, or the script imports it
-    if line := _other_package():
+    if line := WINDOWS if sys.platform == "win32" else _other_package():
         raise SystemExit(f"error: {line}") if command else ImportError(line)
     if command:
         sys.excepthook = _shown

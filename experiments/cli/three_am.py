@@ -1,13 +1,11 @@
-"""The tables of docs/three_am.md, from the declared messages: `python -m experiments.cli.three_am` writes them anew."""
+"""The lists of docs/three_am.md, from the declared messages: `python -m experiments.cli.three_am` writes them anew."""
 
 import re
-from collections.abc import Iterator
 from importlib import import_module
 from string import Formatter
 
 from conf.messages import Message
 from conf.presets import ROOT
-from experiments.reporting.tables import markdown
 from hardware.messages import Fault
 
 PAGE = ROOT.parent / "docs" / "three_am.md"
@@ -15,8 +13,8 @@ TABLE = re.compile(r"(<!-- (alarms|notes|errors) of (\S+) -->\n).*?(<!-- end -->
 
 
 def page(text: str) -> str:
-    """Fill the marked tables of a page."""
-    return TABLE.sub(lambda m: f"{m[1]}{_table(m[2], m[3])}\n{m[4]}", text)
+    """Fill the marked lists of a page."""
+    return TABLE.sub(lambda m: f"{m[1]}{_lines(m[2], m[3])}\n{m[4]}", text)
 
 
 def declared(what: str, room: str) -> list[type[Message]]:
@@ -30,26 +28,27 @@ def _sort(kind: type[Message]) -> str:
     return "alarms" if issubclass(kind, Fault) else "errors" if issubclass(kind, Exception) else "notes"
 
 
-def _table(what: str, room: str) -> str:
-    alarms = what == "alarms"
-    heads = ("the screen says", "it means", *(["the program did"] if alarms else []), "do now")
-    worded = [one for one in declared(what, room) if alarms or re.search(r"\w", _shown(one.says))]
-    return markdown(heads, [list(_cells(one)) for one in worded])
+def _lines(what: str, room: str) -> str:
+    """Write a line per message; an error or note that says all and needs no action has none."""
+    told = [one for one in declared(what, room) if what == "alarms" or _meaning(one) or one.remedy]
+    return "\n" + "\n".join(_line(one) for one in told if what == "alarms" or re.search(r"\w", _shown(one.says))) + "\n"
 
 
-def _cells(kind: type[Message]) -> Iterator[str]:
-    """Yield the sentence of a message, its meaning, its response if it is a fault, its remedy; … is what varies."""
-    name = f"{kind.kind}: " if issubclass(kind, Fault) else ""
-    yield f"`{name}{_shown(kind.says)}`"
-    own = (one.__doc__ for one in kind.__mro__ if one is kind or vars(one).get("response"))
-    yield next(filter(None, own), "").removesuffix(".")
+def _line(kind: type[Message]) -> str:
+    """Write the sentence of a message, the response to a fault, the meaning, and the remedy behind an arrow."""
+    said = f"- `{_shown(kind.says)}`"
     if issubclass(kind, Fault):
-        yield f"`{kind.response}`"
-    yield _shown(kind.remedy)
+        said = f"- `{kind.kind}: {_shown(kind.says)}` ({kind.response})"
+    return said + (_meaning(kind) and f": {_meaning(kind)}") + (kind.remedy and f" → {_shown(kind.remedy)}")
+
+
+def _meaning(kind: type[Message]) -> str:
+    own = (one.__doc__ for one in kind.__mro__ if one is kind or vars(one).get("response"))
+    return next(filter(None, own), "").removesuffix(".")
 
 
 def _shown(words: str) -> str:
-    return "".join(text + "…" * (name is not None) for text, name, _, _ in Formatter().parse(words)).replace("|", "\\|")
+    return "".join(text + "…" * (name is not None) for text, name, _, _ in Formatter().parse(words))
 
 
 if __name__ == "__main__":

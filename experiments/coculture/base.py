@@ -1,4 +1,4 @@
-"""What a law of the composition is told of N cultures."""
+"""What a composition controller gets and returns: N cultures in, N thermostat targets out."""
 
 from dataclasses import dataclass, fields
 
@@ -13,7 +13,7 @@ SHARE = "share"
 """The signal, by which its laws are known."""
 SEEN = ("logit_share", "temperature", "rate", "logit_setpoint")
 SEEN_AHEAD = (*SEEN, "logit_next", "minutes_to_change")
-"""What a learned law sees (envs/coculture/task.py), and where changes are announced; it answers with degC."""
+"""Observation of a learned controller (envs/coculture/task.py), and with announced changes; it returns degC."""
 
 
 @dataclass(frozen=True, eq=False)

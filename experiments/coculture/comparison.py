@@ -107,7 +107,7 @@ class ShareTrial(Trial):
 
 
 def _run(config: BenchmarkConfig, cell: ShareCell, followed: Followed | None) -> ShareTrial:
-    """Run a trial in which a law holds the share, and a controller the density beside it."""
+    """Run a trial in which one controller holds the share and another the density beside it."""
     composition, policy = of_benchmark(config).compositions[cell.controller], followed[0] if followed else None
     scenario, pair = config.scenarios[cell.scenario], read_pair(of_benchmark(config).pair)
     schedule = scenario if cell.announced else replace(scenario, announce_min=0.0)
@@ -160,7 +160,7 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
-    """Load what each law of a share follows, if anything; the run folder keeps copies. Raises: UserError."""
+    """Load what each composition controller needs, if anything; the run folder keeps copies. Raises: UserError."""
     found, two = dict[str, Followed | None](), of_benchmark(config)
     for name in names:
         kept = folder / "policies" / name
@@ -215,7 +215,7 @@ def share_row(trial: ShareTrial) -> dict[str, Any]:
 
 
 def shares(trials: Sequence[ShareTrial]) -> Figure:
-    """Draw a column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
+    """Draw a column per controller: true share, setpoint and the vials' temperature; median and middle 90 %."""
     columns = len(trials)
     figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
     for k, trial in enumerate(trials):
@@ -233,7 +233,7 @@ def shares(trials: Sequence[ShareTrial]) -> Figure:
 
 
 def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Error of every law on every plant of one scenario: mean and 95 % interval."""
+    """Error of every controller on every plant of one scenario: mean and 95 % interval."""
     labels = list(dict.fromkeys(law_of(e) for e in entries))
     marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
     handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
@@ -298,7 +298,7 @@ def _section(out: Page, summary: Row, run: Path) -> None:
 
 
 def _split(study: StudyConfig, cell: Cell) -> list[Cell]:
-    """List a loop for each law of the composition, beside which the controller of the cell holds the density."""
+    """List a loop for each composition controller, beside which the controller of the cell holds the density."""
     two = of_study(study)
     beside = cell.controller, two.announced, two.calibrated
     return [ShareCell(law, cell.plant, cell.scenario, SHARE, *beside) for law in two.compositions]

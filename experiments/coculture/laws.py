@@ -28,9 +28,9 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class LawConfig:
-    """What every law of the composition has."""
+    """What every composition controller has."""
 
-    kind: str = setting("proportional", "which law of the composition")
+    kind: str = setting("proportional", "composition controller")
     control_min: float = setting(1.0, "between decisions; the target is kept in between", "min", within=(1, 240))
     estimator: CompositionEstimatorConfig = part(CompositionEstimatorConfig, "what the filter believes")
 
@@ -101,7 +101,7 @@ class Proportional(Periodic[ProportionalConfig]):
 class PIConfig(LawConfig):
     """The vendor's gains."""
 
-    kind: str = setting("pi", "which law of the composition")
+    kind: str = setting("pi", "composition controller")
     gain: float = setting(15.0, "colder per unit of the share that it is too small", "degC", within=(0, 1000))
     integral: float = setting(0.01, "per unit of the share and decision", "degC", within=(0, 10))
 
@@ -136,7 +136,7 @@ class PI(Periodic[PIConfig]):
 class BangBangConfig(LawConfig):
     """All or nothing."""
 
-    kind: str = setting("bang_bang", "which law of the composition")
+    kind: str = setting("bang_bang", "composition controller")
 
 
 class BangBang(Periodic[BangBangConfig]):
@@ -150,7 +150,7 @@ class BangBang(Periodic[BangBangConfig]):
 class InverseDynamicsConfig(LawConfig):
     """How soon the setpoint is to be reached."""
 
-    kind: str = setting("inverse_dynamics", "which law of the composition")
+    kind: str = setting("inverse_dynamics", "composition controller")
     reach_min: float = setting(30.0, "time constant with which the error is to vanish", "min", within=(1, 1440))
 
 
@@ -171,7 +171,7 @@ class InverseDynamics(Periodic[InverseDynamicsConfig]):
 class MyopicConfig(LawConfig):
     """One look ahead by the model."""
 
-    kind: str = setting("myopic", "which law of the composition")
+    kind: str = setting("myopic", "composition controller")
     control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
@@ -187,7 +187,7 @@ class Myopic(Periodic[MyopicConfig]):
 class MidpointConfig(InverseDynamicsConfig):
     """When to begin, and what holds until then."""
 
-    kind: str = setting("midpoint", "which law of the composition")
+    kind: str = setting("midpoint", "composition controller")
     control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 

@@ -85,8 +85,8 @@ def beside(summary: Row) -> list[Row]:
 def table_2(rows: Sequence[Row], metric: str) -> Table:
     """Build the paper's table for one metric beside this run's.
 
-    The lowest of the paper's three controllers is marked and named on each side. Controllers outside the paper follow
-    in further columns, without a rank.
+    The lowest of the paper's three controllers is named on each side. Controllers outside the paper follow in further
+    columns. Marked is the lowest of each side, without the oracle.
     """
     body: list[tuple[str, ...]] = []
     others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
@@ -95,13 +95,13 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
             p.controller: float(getattr(p, metric)) for p in TABLE_2 if (p.scenario, p.window) == (scenario, window)
         }
         found = {c: _find(rows, controller=c, scenario=scenario, window=window) for c in (*PUBLISHED, *others)}
-        ours = {c: float(r[f"{metric}_mean"]) for c, r in found.items() if r is not None and c in PUBLISHED}
-        low_theirs, low_ours = _lowest(theirs), _lowest(ours)
+        ours = {c: float(r[f"{metric}_mean"]) for c, r in found.items() if r is not None and _runs(r)}
+        low_theirs, low_ours = _lowest(theirs), _lowest({c: v for c, v in ours.items() if c in PUBLISHED})
         cells = [name_of(scenario, window)]
         cells += [_mark(number(theirs.get(c), 4), c == low_theirs) for c in PUBLISHED]
         for c, r in found.items():
             text = "–" if r is None else plus_minus(r[f"{metric}_mean"], r[f"{metric}_sd"])
-            cells.append(_mark(text, c == low_ours))
+            cells.append(_mark(text, c == _lowest(ours)))
         body.append((*cells, low_theirs, low_ours))
     columns = ("window", *(f"{c}, published" for c in PUBLISHED), *(f"{c}, here" for c in (*PUBLISHED, *others)),
                "lowest published", "lowest of the three here")  # fmt: skip
@@ -112,7 +112,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
         columns,
         tuple(body),
         f"Published: real reactors, n = 3. Here: simulation, n = {n}, mean ± standard deviation over replicates; "
-        "plants " + ", ".join(dict.fromkeys(str(r["plant"]) for r in rows)) + ". Marked: lowest of the three.",
+        "plants " + ", ".join(dict.fromkeys(str(r["plant"]) for r in rows)) + ". Marked: lowest, without the oracle.",
     )
 
 
@@ -192,7 +192,7 @@ def matrix(
     columns = ("plant", *laws, *(("sensor-noise floor",) if floor else ()))
     if laws_down:
         (_, *columns_), *rows = zip(columns, *body, strict=True)
-        return Table(name, title, ("law", *columns_), tuple(rows), note)
+        return Table(name, title, ("controller", *columns_), tuple(rows), note)
     return Table(name, title, columns, tuple(body), note)
 
 
@@ -202,6 +202,7 @@ def _mean_sd(row: Row, metric: str, scale: float) -> str:
 
 
 def scaled(row: Row, key: str, scale: float = 1.0) -> str:
+    """Format a value of a row; a dash if it is unknown."""
     return number(None if row[key] is None else scale * row[key])
 
 
@@ -336,9 +337,10 @@ def _in_short(out: Page, summary: Row) -> None:
     unit = dict.fromkeys(RANKED[s][1] for s in dict.fromkeys(str(r["signal"]) for r in summary["rows"]))
     items = [f"{scenario} on {plant}: {_first(laws)}" for (scenario, plant), laws in places.items() if len(laws) > 1]
     alone = [] if items or summary["beside_paper"] else [_alone(summary, e) for e in summary["totals"] if _runs(e)]
-    if items or alone or summary["beside_paper"]:
+    learned = summary["beside_paper"] and _find(beside(summary), controller="dqn")
+    if items or alone or learned:
         out.section("In short")
-    if summary["beside_paper"]:
+    if learned:
         _beside_paper(out, summary)
     if items:
         out.add("verdict", claim=f"Lowest {' and '.join(unit)}, mean of the replicates:", items=items, remark="")
@@ -379,10 +381,8 @@ def _beside_paper(out: Page, summary: Row) -> None:
             f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them for certain "
             "(the 95 % interval of the paired difference is above 0):"
         )
-    elif any(r["controller"] == "dqn" for r in rows):
-        claim = f"The learned policy (dqn) is lowest in all {cells} cells here."
     else:
-        claim = "No learned policy was run."
+        claim = f"The learned policy (dqn) is lowest in all {cells} cells here."
     theirs = published_losses()
     remark = f"In the published table the DQN loses {len(theirs)} of 10: {', '.join(theirs)}."
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)

@@ -86,7 +86,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             f"Every plant, {scenario}",
             f"ISE and ITAE of the measured OD, summed over the windows; mean and 95 % interval, n = "
             f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the "
-            "setpoint. The law hold is off the scale and left out.",
+            "setpoint. The controller hold is off the scale and left out.",
         )
         learned = "dqn_adaptive" if any(e["controller"] == "dqn_adaptive" for e in totals) else "dqn"
         against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == learned]
@@ -97,7 +97,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
                 f"Difference to {learned}, {scenario}",
                 f"Paired over {config.replicates} replicates with the same vials, pumps and noise: mean and 95 % "
                 f"interval, in % of {learned}'s mean. Left of zero: better than {learned}. "
-                "The law hold is off the scale and left out.",
+                "The controller hold is off the scale and left out.",
             )
 
 

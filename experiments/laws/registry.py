@@ -1,4 +1,4 @@
-"""Every law of every signal: its config, what makes it, and what it is made from."""
+"""Every controller of every signal: its config, what makes it, and what it is made from."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ DENSITY = "density"
 
 @dataclass(frozen=True)
 class LawKind:
-    """A law: the class of its config, what makes it, and the parts with which that is called after the config."""
+    """A controller: the class of its config, the function that makes it, and the parts that this function gets."""
 
     config: type[Any]
     make: Callable[..., Any]
@@ -37,7 +37,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class Part:
-    """What a law may be made from, where it is not given: its value, and what is said where it cannot be None."""
+    """A part of a controller: its value where none is given, and the error where it cannot be None."""
 
     usual: Any = None
     missing: str = ""
@@ -105,7 +105,9 @@ def add(
     """
     held = SIGNALS.setdefault(signal, Laws())
     if wrong := set(parts) - set(held.parts):
-        raise ValueError(f"{signal}, law {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(held.parts) or 'none'}")
+        raise ValueError(
+            f"{signal}, controller {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(held.parts) or 'none'}"
+        )
     if held.key and what:
         presets.add(f"{held.key}/{kind}", {"kind": kind}, what)
     held.kinds[kind] = LawKind(config, make, tuple(parts))
@@ -121,12 +123,12 @@ def _kind(kind: str, signal: str) -> LawKind:
 
 
 def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
-    """Whether a law is made from this part, "policy" say. Raises: ValueError naming the laws there are."""
+    """Tell whether a controller is made from this part, e.g. "policy". Raises: ValueError naming the controllers."""
     return part in _kind(kind, signal).parts
 
 
 def on_device(kind: str) -> str:
-    """Return the law of the density, if it needs no simulated plant. Raises: ValueError naming those that do not."""
+    """Return the density controller, if it needs no simulated plant. Raises: ValueError naming those that do not."""
     known = [name for name, law in KINDS.items() if "plant" not in law.parts]
     if kind not in known:
         raise NotAllowed(key="controller_kind", given=kind, allowed=", ".join(known))
@@ -134,7 +136,7 @@ def on_device(kind: str) -> str:
 
 
 def config(kind: str, signal: str = DENSITY) -> Any:
-    """Return the default config of a law. Raises: ValueError naming the laws there are."""
+    """Return the default config of a controller. Raises: ValueError naming the controllers."""
     return _kind(kind, signal).config()
 
 

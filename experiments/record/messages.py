@@ -14,8 +14,8 @@ class StepEnded(Message, says="{reactor}: step {step} ended after {minutes:.0f} 
 class WindowEnds(Message, says="{reactor}: window ends at minute {minute:.0f}, mean error {error:.4f} OD"): ...
 class NoteSeen(Message, says="{note} (noted here once an hour, every time in the journal)"): ...
 class LeftToDevice(Message, says="the device regulates by itself from now on"): ...
-class SupervisorActs(Message, says="the supervisor's law acts, the estimate is in doubt, from minute {minute:.0f}"):
-    """The estimate is out of the bounds of the proof, or readings do not fit it: a one-line controller doses."""
+class SupervisorActs(Message, says="the one-line controller acts for the policy from minute {minute:.0f}"):
+    """The estimate is outside the bounds of the certificate, or readings do not fit it."""
 class PolicyActs(Message, says="the policy acts again from minute {minute:.0f}"):
     """The estimate is back within the bounds."""
 class RecordingGone(Message, says="{path}: deleted or moved in the run",

@@ -205,6 +205,11 @@ def _figures(page: Page, run: Path) -> None:
             page.figure(path, path.stem.replace("_", " "))
 
 
+def _command(run: Path) -> str:
+    """Return the name of a run folder without the number of a step."""
+    return re.sub(r"^\d+_", "", run.name).capitalize()
+
+
 def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
     """Build the page of any command's run: results and configuration. `runs`: the folder itself or runs below it.
 
@@ -213,8 +218,9 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     Args: after: adds further parts of a run; called with the run and its name on a page of several.
     """
     name = folder.resolve()
-    page = Page(f"{name.parent.name}, {name.name}", version())
-    labels = {re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else "": run for run in runs}
+    title = next((c for c in map(_command, (name, *name.parents)) if c[:1].isalpha()), "Run")
+    page = Page(title, f"{name.parent.name}/{name.name}, {version()}")
+    labels = {_command(run) if run != folder else "": run for run in runs}
     if len(labels) < len(runs):
         labels = {run.name: run for run in runs}
     read = [(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping)]

@@ -83,14 +83,14 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
         else f"One configuration, {best.name}"
     )
     middle = f"; the middle half of its {s.n} seeds has {number(s.iqm)} on average" if s.n > 1 else ""
-    text = f"{head}: {what}, is {number(s.worst)} at its worst{middle}"
+    text = f"{head}: {what} {number(s.worst)} at its worst{middle}"
     if len(ranked) > 1:
         other = statistics(ranked[1].measured[name])
         apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]
         text += f"; the next has {number(other.worst)}"
         text += "" if apart else ", and the intervals of the two do not tell them apart"
     if what == MERIT:
-        text += f". That is {'within' if s.worst <= 1.0 else 'beyond'} the limits of the task"
+        text += f". That is {'within' if s.worst <= 1.0 else 'beyond'} the limits of the task, which are a score of 1"
     return f"{text}. {done} of {len(jobs)} jobs finished."
 
 

@@ -23,7 +23,7 @@ LABELS = {
     "volume_ml": "medium, mL",
     "objective": "what the command returned",
 }
-MERIT = "merit of the worst seed (1: limit of the task)"  # returned by train
+MERIT = "score (the larger of regret and error at rest, each divided by its limit)"  # returned by train
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,6 @@ def verdict(summary: Summary, config: Mapping[str, Any]) -> Headline | None:
     return None
 
 
-def _within(holds: bool) -> str:
-    return "within" if holds else "beyond"
-
-
 def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     regret, steady, env = np.array(summary["regret_pct"]), np.array(summary["steady_abs_error"]), config["env"]
     agents = f"{regret.size} agents" if regret.size > 1 else f"one agent, seed {summary['seeds'][0]},"
@@ -64,13 +60,13 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     ]
     if kind != "density":
         return Headline(claim, items)
-    good = float(regret.max()) <= REGRET, float(steady.max()) <= STEADY
-    return Headline(
-        claim,
-        items,
-        f"{'Good' if all(good) else 'Not good yet'}: the regret is {_within(good[0])} the limit of {REGRET:g} %, the "
-        f"error {_within(good[1])} that of {STEADY:g} OD.",
-    )
+    if float(regret.max()) > REGRET:
+        word = f"Not good yet: the regret is above {REGRET:g} %; train longer, or with another seed"
+    elif float(steady.max()) > STEADY:
+        word = f"Nearly optimal, but it rests more than {STEADY:g} OD from a setpoint; another seed may rest closer"
+    else:
+        word = f"Good: at most {REGRET:g} % regret and {STEADY:g} OD at rest"
+    return Headline(claim, items, f"{word}.")
 
 
 def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:

@@ -115,12 +115,15 @@ class SharedLink(Transport):
         return reply
 
     def switched_off(self) -> SwitchedOff:
+        """Return what the board agent switched off."""
         return self._link.switched_off()
 
     def disarm(self) -> None:
+        """Release the board agent."""
         self._link.disarm()
 
     def close(self) -> None:
+        """Close the link."""
         self._link.close()
 
 

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 import envs  # registers the environment
 from envs.gym_adapter import REGISTERED
+from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from envs.vector_env import BioreactorVectorEnv
 
@@ -37,6 +38,18 @@ def test_a_task_is_what_gymnasium_asks_and_continues_from_its_state(name):
     np.testing.assert_array_equal(other.load_state_dict(many.state_dict()), observation)
     for action in (0, 16, 5, 5, 8, 1, 2, 3, 4):
         np.testing.assert_array_equal(many.step(np.full(3, action))[0], other.step(np.full(3, action))[0])
+
+
+def test_the_optimums_actions_in_info_cost_what_the_optimum_costs():
+    env = gymnasium.make(ID, optimum=True, episode_steps=20)
+    _, info = env.reset(seed=3)
+    best, total, over = solve_episode(env.unwrapped.config, info["setpoint"]), 0.0, False
+    ods, _ = best.rollout(np.array([info["od"]]))
+    while not over:
+        assert info["optimal_rate"] == env.unwrapped.config.pump_rates()[info["optimal_action"]]
+        _, reward, _, over, info = env.step(info["optimal_action"])
+        total += reward
+    assert total == pytest.approx(-np.sum((ods[:, 0] - best.setpoint) ** 2))
 
 
 def pair(n, mode, **overrides):

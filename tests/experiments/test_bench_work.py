@@ -219,7 +219,7 @@ def test_a_cold_vial_is_warmed_before_its_blank_is_measured(tmp_path: Path, capl
         backend = ChiBioConfig(
             url=emulator.url, speed=300.0, reactors=("M0", "M1"), calibration=str(tmp_path), temperature=33.0
         )
-        blank(BlankConfig(backend, samples=3), tmp_path)
+        blank(BlankConfig(backend, reactor="M0", samples=3), tmp_path)
         said = [record.getMessage() for record in caplog.records]
         assert truth(emulator)["temperature"] == pytest.approx(33.0, abs=1.5)
     assert not [record for record in caplog.records if record.name.startswith("http")]  # not every request is shown
@@ -228,6 +228,7 @@ def test_a_cold_vial_is_warmed_before_its_blank_is_measured(tmp_path: Path, capl
     assert len(seen) > 1
     assert 24.0 < seen[0][1] < 32.0
     assert seen[-1][1] > seen[0][1]
+    assert [path.name[:2] for path in tmp_path.glob("*blank.yaml")] == ["M0"]
 
 
 @pytest.mark.slow

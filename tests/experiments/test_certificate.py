@@ -148,8 +148,8 @@ def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_perfo
         assert f"{check['name']}: 7.125, allowed 6.5" in "".join(found.refused + found.short)
     kinds = {check.title: check.kind for check in whole}
     assert {title.split(",")[0] for title, kind in kinds.items() if kind == PERFORMANCE} == {
-        "half of the largest dose below the setpoint", "half-width over that of the law",
-        *(("entry after the law's", "share of the band that no attack reaches") if share
+        "half of the largest dose below the setpoint", "half-width over that of the one-line controller",
+        *(("entry after the one-line controller's", "share of the band that no attack reaches") if share
           else ("entry time over the pump's own",)),
     }  # fmt: skip
     assert set(kinds.values()) == {SAFETY, PERFORMANCE}
@@ -410,7 +410,7 @@ def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) ->
             proven and low < 0.0 < high for proven, (low, high) in zip(case["proven"], case["band"], strict=True)
         )
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "nominal: half-width over that of the law, OD" in page
+    assert "nominal: half-width over that of the one-line controller, OD" in page
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert (summary["safe"], summary["passed"]) == (True, True)
     assert [case["case"] for case in summary["cases"]] == ["nominal", "noise", "uncertain", "noise and uncertain"]
@@ -661,8 +661,9 @@ def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
     )  # fmt: skip
     loop = SimpleNamespace(low=strips[:-1], high=strips[1:], in_od=lambda case, width: 10.0 * width)
     assert command._row(loop, proof) == {
-        "case": "a case", "half-width, least": 0.02, "half-width, largest": 0.05, "law, largest": 0.04,
-        "over the law, largest": 0.03, "half-width in OD, middle strip": 0.5,
+        "case": "a case", "half-width, least": 0.02, "half-width, largest": 0.05,
+        "one-line controller, largest": 0.04,
+        "beyond the one-line controller, largest": 0.03, "half-width in OD, middle strip": 0.5,
         "periods after the one-line controller, largest": 3.0, "periods, largest": 7.0,
     }  # fmt: skip
 

@@ -387,7 +387,7 @@ def test_a_trajectory_that_left_its_band_and_came_back_has_left_it() -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[], Policy], str]] = {
-    "random": (lambda: laws.random(0), "half-width over that of the law, safety"),
+    "random": (lambda: laws.random(0), "half-width over that of the one-line controller, safety"),
     "random, other weights": (lambda: laws.random(1), "without a band"),
     "flipped sign": (lambda: laws.law(gain=-laws.GAIN), "washed out"),
     "reversed actions": (lambda: laws.law(order=-1), "washed out"),
@@ -395,9 +395,9 @@ FAULTS: dict[str, tuple[Callable[[], Policy], str]] = {
     "full dose in the low corner": (laws.low_corner, "washed out"),
     "no dose in the high corner": (laws.high_corner, "not entered"),
     "spike": (laws.spike, "half of the largest dose below the setpoint, safety"),
-    "rests far above": (lambda: laws.law(share=-0.5), "half-width over that of the law, safety"),
+    "rests far above": (lambda: laws.law(share=-0.5), "half-width over that of the one-line controller, safety"),
     "rests far below": (lambda: laws.law(share=2.0), "half of the largest dose below the setpoint, safety"),
-    "hardly reacts": (lambda: laws.law(gain=1.0), "half-width over that of the law, safety"),
+    "hardly reacts": (lambda: laws.law(gain=1.0), "half-width over that of the one-line controller, safety"),
     "never doses": (lambda: fewer(laws.law(), [0, 1]), "the pump cannot hold"),
     "never the upper half": (lambda: fewer(laws.law(), [*range(8)]), "the pump cannot hold"),
 }

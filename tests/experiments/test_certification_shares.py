@@ -452,14 +452,14 @@ def test_a_policy_that_is_a_little_worse_than_the_law_fails_by_how_much_it_is(po
     found = certify(policy, replace(FAST, quick=True))
     assert not found.safe
     failed = {check.name: check for check in found.checks if not check.holds}
-    nominal = failed["nominal: half-width over that of the law, periods of full pump"]
+    nominal = failed["nominal: half-width over that of the one-line controller, periods of full pump"]
     assert nominal.value == pytest.approx(excess, abs=2e-3)
     proof, strips = found.proofs[0], found.question.loop
     worse = np.flatnonzero(proof.excess > 0.005)
     assert where[0] <= strips.low[worse].min() + 1e-9
     assert strips.high[worse].max() <= where[1] + 1e-9
-    assert "errors: half-width over that of the law, periods of full pump" in failed
-    assert np.isinf(failed["nominal: entry after the law's, periods"].value)
+    assert "errors: half-width over that of the one-line controller, periods of full pump" in failed
+    assert np.isinf(failed["nominal: entry after the one-line controller's, periods"].value)
 
 
 def test_samples_do_not_see_the_spike_and_the_proof_of_a_device_does() -> None:

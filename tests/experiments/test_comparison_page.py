@@ -244,7 +244,7 @@ def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate
     out = section()
     page.SECTIONS["share"].add(out, {"rows": rows, "paired": paired, "figures": []}, tmp_path)
     tables = {table.name: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
-    two = ("law", "one", "two")
+    two = ("controller", "one", "two")
     assert tables.pop("steps_ratio_abs_error_mean") == (two, [("pi", "0.01", "–"), ("midpoint", "0.02", "0.03")])
     assert tables.pop("steps_ratio_abs_error_last2h") == (two, [("pi", "0.02", "–"), ("midpoint", "0.04", "0.06")])
     assert tables.pop("steps_estimate") == (two, [("pi", "0.03, 9 %", "–"), ("midpoint", "0.06, 18 %", "0.09, 27 %")])
@@ -252,7 +252,7 @@ def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate
     assert tables.pop("steps_od") == (two, density)
     assert tables.pop("steps_paired")[1] == [("midpoint", "+0.0100 [-0.0020, +0.0300], lower in 1 of 3")]
     assert tables.pop("sine_paired")[1] == [("midpoint", "-0.0200, lower in 3 of 3")]
-    assert tables.pop("sine_ratio_abs_error_mean") == (("law", "one"), [("pi", "0.04")])
+    assert tables.pop("sine_ratio_abs_error_mean") == (("controller", "one"), [("pi", "0.04")])
     assert set(tables) == {"sine_ratio_abs_error_last2h", "sine_estimate", "sine_od"}
     assert [heading for heading, _ in out.sections[1:]] == ["steps", "sine"]
 
@@ -261,6 +261,12 @@ def paper_row(law: str, scenario: str, window: str, value: float, plant: str = "
     numbers = {"ise_mean": value, "ise_sd": 0.0, "itae_mean": value, "itae_sd": 0.0, "settling_min": 100.0 * value}
     return {"signal": "density", "controller": law, "plant": plant, "scenario": scenario, "window": window, "n": 5,
             **numbers}  # fmt: skip
+
+
+def test_the_lowest_of_all_controllers_but_the_oracle_is_marked() -> None:
+    rows = [paper_row(law, "setpoint_steps", "0.8", k) for k, law in enumerate(("oracle", "mine", "pi", "mpc"), 1)]
+    [row] = page.table_2(rows, "ise").rows
+    assert [str(cell)[0] for cell in row[4:] if isinstance(cell, page.Emphasis)] == ["2"]
 
 
 def test_agents_are_told_apart_by_their_own_regrets(tmp_path: Path) -> None:

@@ -192,7 +192,7 @@ def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
     taken = {part: [kind for kind in KINDS if registry.takes(kind, part)] for part in ("volume_ml", "policy")}
     assert taken == {"volume_ml": ["pi"], "policy": ["dqn"]}
     assert not registry.takes("pi", "policy", SHARE)
-    with pytest.raises(ValueError, match="law mine: no part models"):
+    with pytest.raises(ValueError, match="mine: no part models"):
         registry.add("mine", baselines.HoldConfig, baselines.Hold, "of no use", ["model", "models"])
     with pytest.raises(ValueError, match=r"controller\.kind = mine"):
         registry.config("mine")

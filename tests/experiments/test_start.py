@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from experiments.__main__ import KINDS
+from experiments.cli import start
 from tests import programs
 from tests.programs import OURS
 
@@ -34,6 +35,14 @@ def started(cwd: Path, path: str, *program: str) -> subprocess.CompletedProcess[
 def clash(name: str, place: Path) -> str:
     remedy = "rename that one, or start the command from another folder"
     return f"package {name} is taken from {place}, not from {ROOT / name}; {remedy}"
+
+
+def test_on_windows_one_line_says_wsl(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    for program, kind in (("-m", SystemExit), ("notebook", ImportError)):
+        monkeypatch.setattr(sys, "argv", [program])
+        with pytest.raises(kind, match="WSL"):
+            start.begin()
 
 
 @pytest.mark.parametrize("name", ["conf", "dqn", "envs", "hardware"])

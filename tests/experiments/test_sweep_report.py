@@ -239,7 +239,7 @@ def test_a_winner_whose_interval_meets_that_of_the_next_is_said_to_be_none(secon
     """The interval of 1, 2 and 3 is from 1 to 3, which the next one's begins below or above; one seed has none."""
     text = compared(tmp_path, a=[1.0, 2.0, 3.0], b=second)
     assert (
-        "Of 2 configurations, agent a is best: regret against the optimum, %, is 3 at its worst; the middle half of its"
+        "Of 2 configurations, agent a is best: regret against the optimum, % 3 at its worst; the middle half of its"
         in text
     )
     assert f"; the next has {max(second):g}" in text
@@ -259,7 +259,7 @@ def test_the_merit_of_the_best_is_judged_against_the_limits_of_the_task(worst: f
     [
         ("steady_abs_error", "density", "train", ", OD"), ("steady_abs_error", "coculture", "train", ", of the share"),
         ("steady_abs_error", "relative", "train", ", periods of full pump"),
-        ("objective", "density", "train", "merit of the worst seed (1: limit of the task)"),
+        ("objective", "density", "train", "each divided by its limit)"),
         ("objective", "density", "deploy", "what the command returned"), ("my_number", "density", "mine", "my_number"),
         ("itae", "density", "deploy", "ITAE over all windows, OD min²"),
     ],

@@ -35,7 +35,7 @@ from experiments.train import main as train
 from experiments.training import run as training
 
 PAGE = Path(__file__).parents[2] / "docs" / "tensorboard.md"
-ROW = re.compile(r"^\| `(\w+/\w+)` \| (.*?) ?\|", re.MULTILINE)
+ROW = re.compile(r"^- `(\w+/\w+)`(?: \((.*?)\))?: ", re.MULTILINE)
 TEN = ["fsync=false", "scenario=hold", "scenario.setpoints=[0.45]", "scenario.minutes=[12]", "scenario.recovery_od=0.1"]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
 SLOW = ["controller=pi", "backend.reactors=[M0,M1]", "bench.period_s=120", "safety.ml_per_run=3"]

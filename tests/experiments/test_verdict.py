@@ -37,11 +37,10 @@ def test_of_several_agents_the_worst_in_each_is_named_whichever_it_is() -> None:
     assert said.remark.startswith("Good: ")
     assert holds(said.remark, "0.5 %", "0.003 OD")
     for worse, words in (
-        ({"regret_pct": [0.2, 0.6]}, ("beyond the limit of 0.5 %", "within that of 0.003 OD")),
-        ({"steady_abs_error": [0.004, 0.0]}, ("within the limit of 0.5 %", "beyond that of 0.003 OD")),
+        ({"regret_pct": [0.2, 0.6]}, ("Not good yet", "0.5 %")),
+        ({"steady_abs_error": [0.004, 0.0]}, ("Nearly optimal", "0.003 OD")),
     ):
         remark = verdict(TRAINED | worse, MODEL).remark
-        assert remark.startswith("Not good yet: ")
         assert holds(remark, *words)
     for env, unit in (("relative", "0.0025 periods of full pump"), ("coculture", "0.0025 of the share")):
         other = verdict(found, {"env": {"kind": env}})

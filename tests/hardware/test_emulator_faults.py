@@ -339,6 +339,6 @@ def test_a_fault_of_one_reactor_is_not_its_neighbour_s(name: str) -> None:
 def test_every_fault_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
     for name, (_, values, effect) in FAULTS.items():
-        assert f"| `{name}` |" in text
+        assert f"- `{name}` (" in text
         assert values in text
         assert effect in text

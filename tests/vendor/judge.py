@@ -100,7 +100,8 @@ def told(lines: list[tuple[float, str]], since: float, words: str = "") -> tuple
 def page() -> list[re.Pattern[str]]:
     """The lines that docs/three_am.md explains."""
     text = (ROOT / "docs" / "three_am.md").read_text()
-    spans = {span for line in text.splitlines() if line.startswith("|") for span in re.findall(r"`([^`]+)`", line)}
+    lines = [line for line in text.splitlines() if line.startswith(("|", "-"))]
+    spans = {span for line in lines for span in re.findall(r"`([^`]+)`", line)}
     worth = [span for span in spans if len(span.replace("…", "").strip("; .,:")) >= 8]
     return [re.compile(".+?".join(map(re.escape, span.strip("…").split("…")))) for span in worth]
 

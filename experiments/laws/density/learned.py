@@ -100,12 +100,11 @@ def lead(q: np.ndarray) -> dict[str, Array]:
 class RelativeController:
     """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s of the `Estimator`.
 
-    A supervisor stands over it. Where the estimator's surprises do not fit what it believes, or twice its sd of e or s
-    leaves the bounds of the certificate, the one-line law u = u_max clip(e + s, 0, 1) decides, on a second filter whose
-    settings nobody can change (docs/certificate.md, The supervisor). Innovations do not fit that are far too large and
-    larger than those of the second filter, or long far too small while those of the second filter are not. The error of
-    s is how far the s that the policy is shown may lie from the true one, which is between 0 and the highest that was
-    proven: above it no pump rate holds the culture.
+    A supervisor watches the estimator. The one-line controller u = u_max clip(e + s, 0, 1) decides, on a second filter
+    with fixed settings (docs/certificate.md, The supervisor), while twice the sd of e or s is beyond the bounds of the
+    certificate, or while innovations are far too large, or far too small for long, and those of the second filter are
+    not. The error of s is the largest distance of the s that the policy observes from the true one, between 0 and the
+    highest proven s: above that no pump rate holds the culture.
 
     Args: policy: with observation (error, growth_share). estimator: its settings. model: mu, tau, control period and
       largest pump rate; the filters start at mu and tau. bounds: of the certificate; None: only innovations are
