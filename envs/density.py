@@ -7,8 +7,6 @@ from envs.gym_adapter import EpisodeEnv
 from envs.optimum import solve_episode
 from envs.vector_env import BioreactorVectorEnv
 
-__all__ = ["BioreactorEnv"]
-
 
 class BioreactorEnv(EpisodeEnv):
     """`BioreactorVectorEnv` as one environment. Version history: v0, the task of the paper.

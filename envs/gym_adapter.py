@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from envs.vector_env import EpisodeSpec, EpisodeVectorEnv
 
-__all__ = ["EpisodeEnv", "register"]
-
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.density:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),

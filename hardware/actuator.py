@@ -3,8 +3,6 @@
 import math
 from dataclasses import dataclass
 
-__all__ = ["FEED", "SPARE", "THERMOSTAT", "Actuator"]
-
 
 @dataclass(frozen=True)
 class Actuator:

@@ -7,8 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-__all__ = ["Clock", "DeviceClock", "RealClock", "RunTime", "VirtualClock", "boot", "run_time", "uptime"]
-
 STEP_S = 30.0
 """Real seconds by which the clock of the day may differ from what is known of the time before that is told."""
 

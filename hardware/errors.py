@@ -6,17 +6,6 @@ Every message names the thing, its value with unit, the allowed range and the re
 
 from conf.messages import Message
 
-__all__ = [
-    "DeviceStateError",
-    "IdentityError",
-    "LinkError",
-    "ProtocolError",
-    "ReactorError",
-    "RecordingError",
-    "SensorError",
-    "UnfitError",
-]
-
 
 class ReactorError(Message, Exception):
     """Base of all errors of this package."""

@@ -28,8 +28,6 @@ from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
 from hardware.storage.messages import JournalMissing
 
-__all__ = ["Can", "Check", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at", "report"]
-
 log = logging.getLogger(__name__)
 
 

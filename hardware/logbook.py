@@ -7,8 +7,6 @@ from typing import Any
 from conf.messages import Message
 from hardware.messages import Fault
 
-__all__ = ["Log", "Logbook", "no_log"]
-
 Log = Callable[[str, Mapping[str, Any]], None]
 """Takes a kind and its fields, for instance `Journal.append`."""
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from hardware.errors import ReactorError
 from hardware.messages import Fault, NotLeftOff
 
-__all__ = ["Command", "KeepsLevels", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
-
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]

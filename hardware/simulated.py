@@ -11,8 +11,6 @@ from envs.plant.plant import Plant, PlantConfig
 from hardware.family import Can, Family, Opening
 from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 
-__all__ = ["FAMILY", "SimulatedConfig", "SimulatedFamily", "SimulatedReactors"]
-
 
 @dataclass(frozen=True)
 class SimulatedConfig:

@@ -17,8 +17,6 @@ from hardware.messages import PumpsNotOff
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
 from hardware.storage.history import History
 
-__all__ = ["Newest", "Plan", "Station", "Stations"]
-
 AGAIN_S = 20.0  # from one `measure` without a sample to the next, while there is none
 
 

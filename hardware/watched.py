@@ -11,8 +11,6 @@ from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
-__all__ = ["Watched", "WatchedInterlock", "WatchedSafety"]
-
 LASTING = 3  # samples in a row: a single odd reading withholds no dose here
 
 

@@ -14,8 +14,6 @@ from envs.coculture.pair import PairConfig
 from envs.plant.noise import Streams, Tape, uniform
 from envs.plant.sensor import FULL_SCALE
 
-__all__ = ["DAY_MIN", "FluorescenceConfig", "FluorescenceSensor"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

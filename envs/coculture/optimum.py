@@ -21,8 +21,6 @@ from envs.coculture.task import CocultureConfig, advance, share
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-__all__ = ["Grid", "Transitions", "best_action", "cost_to_go", "transitions"]
-
 Array = NDArray[np.float64]
 
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from conf import presets
 from conf.schema import build, check, part, require, setting
 
-__all__ = ["PairConfig", "PigmentConfig", "SpeciesConfig", "named_pair"]
-
 Array = NDArray[np.float64]
 
 STEPS = 71  # of temperatures between which crossings are sought

@@ -13,8 +13,6 @@ from envs.plant.noise import Streams, spread, uniform
 from envs.plant.plant import PlantConfig
 from envs.plant.strains import REFERENCE_TEMPERATURE, TEMPERATURE_LAWS, Strain, response
 
-__all__ = ["OfPlant", "SecondSpeciesConfig", "of_pair", "of_plant", "sensor", "strain"]
-
 Array = NDArray[np.float64]
 
 

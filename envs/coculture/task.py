@@ -22,11 +22,6 @@ from envs.coculture.pair import PairConfig
 from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
 
-__all__ = [
-    "LOGIT", "NEXT", "RATE", "SCALES", "SETPOINT", "TEMPERATURE", "TIME", "CocultureConfig", "CocultureEnv",
-    "CocultureVectorEnv", "advance", "at_rest", "limits", "logit", "passed", "share",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 LOGIT, TEMPERATURE, RATE, SETPOINT, NEXT, TIME = range(6)

@@ -19,8 +19,6 @@ from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 
-__all__ = ["FORMAT", "FormatError", "Opinion", "Stored", "beside", "bounds", "content", "judged", "load"]
-
 FORMAT = 3
 BETTER = "train with another seed or n_agents=8, or use policy=shipped"
 

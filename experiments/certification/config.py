@@ -7,9 +7,6 @@ from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.task import EnvConfig
 
-__all__ = ["CertifyConfig", "Limits"]
-
-
 ASKED = ("uncertainty", "noise", "error", "error_od", "error_share", "error_gain")  # larger values are stricter
 
 

@@ -8,8 +8,6 @@ from matplotlib.figure import Figure
 from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["figure"]
-
 
 def figure(found: Certificate) -> Figure:
     """Draw four panels over the setpoint (or the growth share)."""

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from experiments.certification.polygons import Array, Regions
 
-__all__ = ["Band", "Index", "Mask", "Pieces", "Points", "States", "crossings", "drops", "images", "points_in_strips"]
-
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 States = Callable[[Array, Array], tuple[Array, Array]]

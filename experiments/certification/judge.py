@@ -14,8 +14,6 @@ from experiments.certification.polygons import Array, Network, Regions, contradi
 from experiments.certification.question import Question, actions, question
 from experiments.certification.verdict import Proof, attacked, dose_below, prove
 
-__all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Requirement", "certify", "recheck", "worst"]
-
 KINDS = SAFETY, PERFORMANCE = "safety", "performance"
 GRID = (256, 128)  # boxes of the cross-check
 ENOUGH = 100  # trajectories per strip that are enough to require the ends of a band

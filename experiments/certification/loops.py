@@ -14,8 +14,6 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.certification.intervals import Pieces, States
 from experiments.certification.polygons import Array
 
-__all__ = ["Loop", "OdCase", "OdLoop", "ShareCase", "ShareLoop"]
-
 NEAR_ZERO = 1e-9  # fraction of a setpoint that represents an OD of zero
 
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from dqn.policy import Policy
 
-__all__ = ["Array", "Network", "Regions", "area", "contradictions", "partition", "possible", "rounding"]
-
 Array = NDArray[np.float64]
 
 UNIT = 2.0**-24  # relative rounding error of one operation in single precision

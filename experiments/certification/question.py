@@ -14,8 +14,6 @@ from experiments.certification.config import CertifyConfig
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.polygons import Array
 
-__all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
-
 BEYOND = 1e-6  # margin of the plane beyond the required range
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
 

@@ -11,8 +11,6 @@ from experiments.certification.intervals import Band, Index, Mask, Points, image
 from experiments.certification.loops import Loop
 from experiments.certification.polygons import Array
 
-__all__ = ["Proof", "attacked", "dose_below", "prove"]
-
 STILL = 1e-9  # smaller changes of the state in a period count as zero
 ATTACKED = 60  # periods of an attacking trajectory
 SETTLED = 20  # of them until the start has no influence

@@ -5,9 +5,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.laws.base import Array, Mask
-
-__all__ = ["SEEN", "SEEN_AHEAD", "SHARE", "Array", "Mask", "ShareEstimate", "Wanted"]
+from experiments.laws.base import Array as Array
+from experiments.laws.base import Mask as Mask
 
 SHARE = "share"
 """The signal, by which its laws are known."""

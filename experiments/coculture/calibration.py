@@ -9,8 +9,6 @@ from envs.coculture.pair import PairConfig
 from experiments.coculture.base import Array
 from experiments.coculture.estimator import CompositionEstimatorConfig
 
-__all__ = ["SensorCalibration", "calibrate_sensor"]
-
 OD_TERM = CompositionEstimatorConfig().od_term
 
 

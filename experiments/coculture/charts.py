@@ -14,8 +14,6 @@ from experiments.coculture.program import program_of
 from experiments.record.record import Recordings
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["composition_figure_of", "episodes", "pair_figure"]
-
 Array = NDArray[np.float64]
 
 

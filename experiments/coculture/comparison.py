@@ -39,11 +39,6 @@ from experiments.reporting.page import Page
 from experiments.reporting.tables import number
 from hardware.safety.config import SafetyConfig
 
-__all__ = [
-    "ShareCell", "ShareTrial", "abs_error", "calibrate", "last_hours", "policies_of", "share_errors", "share_row",
-    "shares", "with_pair",
-]  # fmt: skip
-
 FACTOR_SD, OFFSET_SD = 0.02, 5.0
 """Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
 FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # laws that act on what is announced

@@ -23,11 +23,6 @@ from experiments.training.config import TrainConfig
 from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 
-__all__ = [
-    "OfBenchmark", "OfDeploy", "OfEmulator", "OfStudy", "OfTrain", "completed", "of_benchmark", "of_deploy", "of_study",
-    "read_curves", "read_pair",
-]  # fmt: skip
-
 log = logging.getLogger(__name__)
 
 USUAL = "ecoli_pputida"

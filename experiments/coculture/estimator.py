@@ -11,8 +11,6 @@ from envs.coculture.fluorescence import DAY_MIN
 from envs.coculture.pair import PairConfig
 from experiments.coculture.base import Array, Mask, ShareEstimate
 
-__all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
-
 Rows = NDArray[np.intp]
 
 LOGIT, LOG_OD, LOG_F, LOG_Q, BIAS_E, BIAS_P, GAIN, FACTOR, OFFSET, THERMOMETER = range(10)

@@ -17,12 +17,6 @@ from experiments.coculture.base import SEEN, SEEN_AHEAD, Array, Mask, ShareEstim
 from experiments.coculture.estimator import CompositionEstimatorConfig
 from experiments.coculture.program import Program
 
-__all__ = [
-    "PI", "BangBang", "BangBangConfig", "InverseDynamics", "InverseDynamicsConfig", "LawConfig", "LearnedLaw",
-    "LearnedLawConfig", "Midpoint", "MidpointConfig", "Myopic", "MyopicConfig", "Optimum", "OptimumConfig", "PIConfig",
-    "Periodic", "PreviewLawConfig", "Proportional", "ProportionalConfig", "Receding", "RecedingConfig",
-]  # fmt: skip
-
 Index = NDArray[np.intp]
 
 

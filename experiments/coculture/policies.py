@@ -11,8 +11,6 @@ from experiments.coculture.program import Program
 from experiments.control.policies import SHIPPED, find_policy, keep, readable
 from experiments.laws import registry
 
-__all__ = ["KEPT", "SHIPPED_COMPOSITION", "check_shares", "composition_policy"]
-
 log = logging.getLogger(__name__)
 
 SHIPPED_COMPOSITION = {

@@ -11,8 +11,6 @@ from conf.schema import require, setting
 from envs.scenario import Phased, Scenario
 from experiments.coculture.base import Array, Wanted
 
-__all__ = ["SINE_LEAD_MIN", "Program", "Ratios", "composed", "program_of", "ratios_of", "resting"]
-
 ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
 
 SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4

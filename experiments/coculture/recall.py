@@ -10,8 +10,6 @@ import numpy as np
 from experiments.coculture.base import Array, Mask, ShareEstimate
 from experiments.coculture.estimator import CompositionEstimator
 
-__all__ = ["Recall"]
-
 KEPT_MIN, EVERY_MIN = 2880.0, 60.0  # a plate is counted a day after it was spread; from each copy on all is replayed
 AT_ONCE = 480  # readings and doses that are taken again with each new reading: some .2 s
 

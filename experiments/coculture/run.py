@@ -29,8 +29,6 @@ from hardware.family import family_of
 from hardware.safety.config import SafetyConfig
 from hardware.storage import atomic
 
-__all__ = ["TwoSpecies"]
-
 log = logging.getLogger(__name__)
 
 COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # presets

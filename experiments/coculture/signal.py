@@ -22,8 +22,6 @@ from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
-__all__ = ["COLUMNS", "TRUE", "LightSignal", "Share", "ShareWarnings"]
-
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"

@@ -32,8 +32,6 @@ from experiments.coculture import charts
 from experiments.coculture.base import SEEN, SEEN_AHEAD
 from experiments.training.evaluation import Rollout, each, rollout
 
-__all__ = ["Coculture"]
-
 Array = NDArray[np.float64]
 SPAN = 3.0  # |logit of the share| that is trained: 0.05 to 0.95
 FINE = Grid(logits=321)

@@ -10,8 +10,6 @@ from envs.task import EnvConfig
 from experiments.laws import registry
 from experiments.training.config import agent_schema
 
-__all__ = ["SETTLING_MIN", "TABLE_2", "TWIN", "BenchmarkConfig", "Published", "StudyConfig"]
-
 TWIN = "twin"  # the plant of a plant_file
 
 

@@ -17,8 +17,6 @@ from experiments.comparison.trials import DensityTrial
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
 from experiments.reporting.tables import clock
 
-__all__ = ["LONG_MIN", "bands", "by_plant", "differences", "estimate", "plants", "published_and_ours"]
-
 Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks

@@ -11,11 +11,6 @@ from experiments.comparison.config import TABLE_2
 from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
-__all__ = [
-    "RANKED", "SECTIONS", "Measure", "Section", "law_of", "losses", "matrix", "of_benchmark", "published_losses",
-    "scaled", "table_2", "tables",
-]  # fmt: skip
-
 Row = Mapping[str, Any]
 METRICS = ("ise", "itae")
 PUBLISHED = ("dqn", "pi", "mpc")

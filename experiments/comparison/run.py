@@ -25,8 +25,6 @@ from experiments.reporting import charts, page
 from experiments.reporting.tables import count
 from experiments.training.config import TrainConfig
 
-__all__ = ["COMPLETED", "FOLLOWED", "benchmark", "with_seeds", "with_twin"]
-
 log = logging.getLogger(__name__)
 
 COMPLETED: list[Callable[[BenchmarkConfig], BenchmarkConfig]] = []

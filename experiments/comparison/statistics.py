@@ -10,10 +10,6 @@ from scipy.stats import t as student
 
 from experiments.comparison.trials import DensityTrial, Trial, Window, windows
 
-__all__ = [
-    "ROWS", "SCORES", "Scored", "Spread", "details", "pairs", "row", "rows", "total_scores", "totals",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 METRICS = ("ise", "itae")
 TOLD = {

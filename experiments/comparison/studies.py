@@ -14,8 +14,6 @@ from experiments.comparison.config import SETTLING_MIN, TABLE_2, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, Trial
 from experiments.reporting.calibration_charts import fit_figure
 
-__all__ = ["AGAINST", "DRAWN", "Drawing", "calibration", "draw", "summarise"]
-
 CAPTIONS = {
     "regulation": "Regulation at 0.5 (the paper's Fig. 2c)",
     "setpoint_steps": "Three setpoints (the paper's Fig. 3a-b)",

@@ -38,11 +38,6 @@ from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
-__all__ = [
-    "RUNS", "SPLITS", "Cell", "DensityTrial", "Followed", "Loops", "Trial", "Window", "cells", "closed", "record",
-    "run_cell", "run_trial", "windows",
-]  # fmt: skip
-
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 
-__all__ = ["Accounts", "Array", "Controller", "ControllerConfig", "Explains", "Mask", "Watches", "usable"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

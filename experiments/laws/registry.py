@@ -21,8 +21,6 @@ from experiments.laws.density.mpc import Mpc, MpcConfig
 from experiments.laws.density.oracle import Oracle, OracleConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["DENSITY", "KINDS", "LawKind", "Laws", "Part", "add", "build", "config", "hold", "on_device", "takes"]
-
 DENSITY = "density"
 
 

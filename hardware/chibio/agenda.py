@@ -6,8 +6,6 @@ from collections.abc import Generator
 
 from hardware.clock import Clock
 
-__all__ = ["Agenda", "Task"]
-
 Task = Generator[float, None, None]
 """A generator that does its work in steps; what it yields is the pause in seconds until its next step."""
 

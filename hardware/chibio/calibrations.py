@@ -12,8 +12,6 @@ from hardware.errors import UnfitError
 from hardware.storage import atomic
 from hardware.storage.yaml_text import read_text
 
-__all__ = ["load_calibrations", "save_calibration"]
-
 PARTS = ("feed", "waste", "blank")
 
 

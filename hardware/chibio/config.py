@@ -10,8 +10,6 @@ from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS, Permitted
 from hardware.link.transport import TransportConfig, require_web_address
 
-__all__ = ["ChiBioConfig", "EmulatorConfig"]
-
 
 @dataclass(frozen=True)
 class ChiBioConfig:

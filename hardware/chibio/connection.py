@@ -10,8 +10,6 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorE
 from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, no_log
 
-__all__ = ["DRAIN", "Connection", "identity"]
-
 SEEN_S = 1.0
 """For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
 Later the next command looks first, because a server that starts carries out what it was sent meanwhile, even to a

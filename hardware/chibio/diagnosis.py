@@ -8,8 +8,6 @@ from hardware.chibio.protocol import DeviceState
 from hardware.errors import DeviceStateError, IdentityError, ReactorError
 from hardware.messages import Fault
 
-__all__ = ["describe", "diagnose", "fault_of", "regulates"]
-
 
 def regulates(state: DeviceState, setpoint: float) -> bool:
     """Whether the device regulates at `setpoint`; False for nan."""

@@ -21,8 +21,6 @@ from hardware.logbook import Logbook
 from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
-__all__ = ["DoseSequence"]
-
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
 LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then

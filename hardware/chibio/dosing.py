@@ -11,17 +11,6 @@ from conf.schema import build, check, require, setting
 from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
 from hardware.stations import Plan
 
-__all__ = [
-    "DosePlan",
-    "DosingConfig",
-    "PumpCalibration",
-    "PumpFit",
-    "ReactorCalibration",
-    "SupplyConfig",
-    "fit_pump",
-    "plan_dose",
-]
-
 Array = NDArray[np.float64]
 
 MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`protocol.check_command`) refuses more

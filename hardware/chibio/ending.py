@@ -16,8 +16,6 @@ from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory, Span
 from hardware.storage.doses import Ending
 
-__all__ = ["SAME_S", "conclude", "found"]
-
 SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last request that it heard is not on record
 SAME_S = 1e-3  # on-times that differ by less are one target: a path carries six digits of it
 MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer

@@ -20,8 +20,6 @@ from hardware.link.open import DeviceLock, open_transport
 from hardware.link.transport import Transport
 from hardware.reactor import Array, Reactor, left_off
 
-__all__ = ["FAMILY", "ChiBioFamily", "linked"]
-
 Link = tuple[Transport, Clock]
 
 

@@ -13,8 +13,6 @@ from hardware.chibio.messages import PutRight, SlotAmiss
 from hardware.chibio.protocol import BANDS, LEDS, SLOTS, DeviceState, Slot
 from hardware.logbook import Logbook
 
-__all__ = ["Fluorescence", "FluorescenceSlotConfig"]
-
 HIDDEN = "not shown with its settings: update the device's software or the agent on its board"
 
 

@@ -14,8 +14,6 @@ from hardware.chibio.messages import OverflowPumpAmiss, PutRight
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
 from hardware.logbook import Logbook
 
-__all__ = ["OverflowPump", "OverflowPumpConfig"]
-
 MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever be told to deliver
 
 

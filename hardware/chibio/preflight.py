@@ -18,8 +18,6 @@ from hardware.family import Check
 from hardware.link.transport import Transport
 from hardware.logbook import no_log
 
-__all__ = ["preflight"]
-
 MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
 FULL_SCALE = 65535.0  # counts of the spectrometer
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)

@@ -11,8 +11,6 @@ from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
 from hardware.reactor import Array, Measurement
 
-__all__ = ["dose_series", "measure_blanks", "warm_up"]
-
 PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
 LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
 

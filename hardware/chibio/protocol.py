@@ -12,11 +12,6 @@ from typing import Any
 
 from hardware.chibio.messages import Forbidden, NotUnderstood
 
-__all__ = [
-    "BANDS", "CONTROL_S", "FEED", "LEAST_ML", "LEDS", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS",
-    "SLOTS", "SPARE", "UNSET_BLANK", "WASTE", "DeviceState", "Slot", "check_command", "parse_state",
-]  # fmt: skip
-
 POSITIONS = tuple(f"M{k}" for k in range(8))
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 FEED, WASTE = "Pump1", "Pump2"

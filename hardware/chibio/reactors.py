@@ -28,8 +28,6 @@ from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, Logbook, no_log
 from hardware.stations import Stations
 
-__all__ = ["ChiBioReactors"]
-
 SLOWEST_S = 61.0  # a cycle of the device takes at most so long as a rule
 
 

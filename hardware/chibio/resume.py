@@ -12,8 +12,6 @@ from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
 from hardware.storage.doses import feeds_by
 from hardware.storage.history import History
 
-__all__ = ["NEVER", "ReactorHistory", "Span", "replay"]
-
 SPANS = {f"{part}_{what}" for part in ("feed", "waste") for what in ("on", "off", "anew")}
 NEVER = (math.nan, math.nan)
 

@@ -10,8 +10,6 @@ from hardware.chibio.protocol import DeviceState
 from hardware.clock import Clock
 from hardware.stations import Newest
 
-__all__ = ["FIRST_SAMPLE_S", "Sampling"]
-
 CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 

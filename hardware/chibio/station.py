@@ -24,8 +24,6 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorE
 from hardware.logbook import Logbook
 from hardware.stations import Station
 
-__all__ = ["ChibioStation"]
-
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 MEASURING_S = 20.0  # settling, four readings, three temperatures and three fluorescence slots take less
 HELD_S = 30.0  # for so long a new sample waits for what the last dose came to

@@ -14,8 +14,6 @@ import numpy as np
 
 from hardware.emulator.faults import Switches
 
-__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Due", "EventQueue", "ProcessDied", "Steps"]
-
 Steps = Generator[float, None, None]
 
 EPOCH = 1_767_225_600.0  # the board's clock at device second 0: 2026-01-01 00:00:00

@@ -24,8 +24,6 @@ from hardware.emulator.supervisor import REQUEST, Supervisor
 from hardware.emulator.sysdata import ALL_REACTORS
 from hardware.emulator.vial import FEED, Vial, VialConfig
 
-__all__ = ["ChiBioDevice", "DeviceOptions", "plant_preset"]
-
 
 @functools.cache
 def plant_preset(name: str) -> PlantConfig:

@@ -10,8 +10,6 @@ from hardware.emulator.outputs import BUS_S, PERIOD_FACTOR, Outputs, Position
 from hardware.emulator.sysdata import SysData, append_records, clear_terminal, thin_records
 from hardware.emulator.vial import StoredSample
 
-__all__ = ["Experiment"]
-
 READINGS = 4
 READING_PAUSE_S = 0.25
 SETTLE_S = 5.0

@@ -16,8 +16,6 @@ from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.server import build, parser
 from hardware.emulator.transport import EmulatorTransport
 
-__all__ = ["FAMILY", "EmulatorFamily"]
-
 log = logging.getLogger(__name__)
 EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
 

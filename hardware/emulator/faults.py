@@ -6,8 +6,6 @@ from typing import Any
 
 from hardware.emulator.sysdata import SLOTS
 
-__all__ = ["FAULTS", "Switches", "inject"]
-
 # name: (kind, allowed values, what it does)
 #   board: no reactor needed; vial: of a reactor; both are `Switches`; plant: a switch of the plant; act: done once
 FAULTS: dict[str, tuple[str, str, str]] = {

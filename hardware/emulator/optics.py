@@ -7,8 +7,6 @@ from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.outputs import Outputs, Position, store_target
 from hardware.emulator.sysdata import SLOTS
 
-__all__ = ["Optics"]
-
 EXPOSURE_S = 0.97  # one spectrometer reading
 FLUORESCENCE_S = 1.0  # LED on, one reading, LED off
 PYOVERDINE = ("LEDA", "nm440")  # 395 nm in, 440 nm out (docs/plant.md)

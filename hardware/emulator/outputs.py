@@ -6,8 +6,6 @@ from hardware.emulator.computer import AppError, Computer, ProcessDied, Steps
 from hardware.emulator.sysdata import LIGHTS, PUMPS, SysData, add_terminal, fresh_sysdata
 from hardware.emulator.vial import Vial, VialConfig
 
-__all__ = ["BUS_S", "PERIOD_FACTOR", "Outputs", "Position", "store_target"]
-
 BUS_S = 0.02  # a register written and read back
 PERIOD_FACTOR = 1.05  # pump period over cycle time: 63 s
 OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running motor stops, until the pause is counted

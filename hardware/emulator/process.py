@@ -9,8 +9,6 @@ from contextlib import AbstractContextManager
 
 from hardware.errors import LinkError
 
-__all__ = ["EmulatorProcess"]
-
 START_S = 60.0
 
 

@@ -10,8 +10,6 @@ from hardware.emulator.computer import Steps
 from hardware.emulator.software import Software
 from hardware.emulator.sysdata import ALL_REACTORS, clear_terminal
 
-__all__ = ["HTML", "Exchange", "answer_request", "find_route"]
-
 LONG_ROUTE_S = 1.9  # GetSpectrum, ExperimentReset
 HTML = {"Content-Type": "text/html; charset=utf-8"}
 

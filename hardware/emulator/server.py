@@ -34,8 +34,6 @@ from hardware.emulator.faults import FAULTS, inject
 from hardware.emulator.routes import Exchange
 from hardware.emulator.vial import SPARE, VialConfig
 
-__all__ = ["EmulatorServer", "main"]
-
 PREFIX = "/_emulator/"
 POLL_S = 0.05  # real seconds between looks at the device when nobody asks
 CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request

@@ -16,8 +16,6 @@ from hardware.emulator.outputs import Outputs, Position
 from hardware.emulator.sysdata import ALL_REACTORS
 from hardware.emulator.vial import Vial
 
-__all__ = ["ReactorApp", "Software"]
-
 
 class ReactorApp(Position):
     """A position with its outputs, its optics and its experiment; arguments as `Position`."""

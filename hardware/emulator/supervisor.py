@@ -8,8 +8,6 @@ from hardware.emulator.routes import HTML, Exchange, answer_request
 from hardware.emulator.software import Software
 from hardware.emulator.vial import Vial
 
-__all__ = ["REQUEST", "Supervisor"]
-
 REQUEST = "request"  # owner of the events of the request being served
 ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>Internal Server Error</h1>\n"
 BOOT_S = 8.0  # from a dead worker to a serving one

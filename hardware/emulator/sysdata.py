@@ -4,11 +4,6 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = [
-    "ALL_REACTORS", "LIGHTS", "PUMPS", "SLOTS", "SysData", "add_terminal", "append_records", "clear_terminal",
-    "fresh_sysdata", "thin_records",
-]  # fmt: skip
-
 SysData = dict[str, Any]
 
 ALL_REACTORS = tuple(f"M{k}" for k in range(8))

@@ -5,8 +5,6 @@ from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError
 from hardware.link.transport import Reply, Transport
 
-__all__ = ["EmulatorTransport"]
-
 HEADERS = {"X-Requested-With": "XMLHttpRequest"}
 
 

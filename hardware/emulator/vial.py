@@ -15,8 +15,6 @@ from envs.plant.plant import Plant
 from envs.plant.sensor import density
 from hardware.emulator.faults import Switches
 
-__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Spectrometer", "StoredSample", "Vial", "VialConfig"]
-
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
 

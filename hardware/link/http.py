@@ -17,8 +17,6 @@ from hardware.errors import ReactorError
 from hardware.link import messages, transport
 from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session
 
-__all__ = ["HttpTransport", "fetch"]
-
 AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
 REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -10,8 +10,6 @@ from typing import Any
 from hardware.clock import Clock
 from hardware.link.messages import BrokerNotReached, NoMqtt
 
-__all__ = ["MqttLink"]
-
 
 class MqttLink:
     """One client of a broker.

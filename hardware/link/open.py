@@ -14,8 +14,6 @@ from hardware.link.messages import DeviceTaken
 from hardware.link.serial import SerialTransport
 from hardware.link.transport import Transport, TransportConfig, new_session
 
-__all__ = ["DeviceLock", "open_transport"]
-
 
 class DeviceLock:
     """A device's name in the kernel: one for all users of this computer, free when it is closed or the process ends.

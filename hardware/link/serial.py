@@ -22,8 +22,6 @@ from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, Tra
 if TYPE_CHECKING:
     import serial
 
-__all__ = ["SerialTransport", "decode_header", "encode_request"]
-
 NOT_IN_CHARGE = 21  # status of a request that the agent refuses, because another client is in charge
 MAX_REQUEST = 512  # bytes of a request line with its newline
 _HEADER = re.compile(rb"^<(\d{1,10}) (\d{1,3}) (\d{1,6}) ([0-9a-f]{8})$")

@@ -18,11 +18,6 @@ from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError
 from hardware.link import messages
 
-__all__ = [
-    "MAX_BODY", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
-    "read_secret", "require_web_address", "switched_off",
-]  # fmt: skip
-
 SwitchedOff = Mapping[str, Mapping[str, float]]
 """Reactor, pump: how many device seconds ago a dead-man switch on the way found it on and switched it off."""
 

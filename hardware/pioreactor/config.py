@@ -7,8 +7,6 @@ from conf.schema import check, part, require, setting
 from hardware.clock import DeviceClock
 from hardware.link.transport import read_secret, require_web_address
 
-__all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
-
 PASSWORD = "PIOREACTOR_MQTT_PASSWORD"
 """Variable of the environment that holds the broker's password; without it and without a file the vendor's own."""
 SHIPPED = "raspberry"  # what the vendor's installation sets, public

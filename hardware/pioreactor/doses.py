@@ -21,8 +21,6 @@ from hardware.stations import Plan
 from hardware.storage.doses import Ending, Given, feeds_by
 from hardware.storage.history import History
 
-__all__ = ["Doses", "UnitHistory", "replay"]
-
 DRAIN_ML = 4.0  # at a time and more, while a media pump runs on
 DRAINS = 5  # attempts to empty a vial after that
 

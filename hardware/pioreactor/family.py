@@ -20,8 +20,6 @@ from hardware.pioreactor.preflight import preflight
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.reactor import Array, Reactor, left_off
 
-__all__ = ["FAMILY", "PioreactorFamily"]
-
 Reached = AbstractContextManager[PioreactorConfig]
 
 

@@ -13,8 +13,6 @@ from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.messages import MessageIgnored, OtherClient
 
-__all__ = ["CHANNELS", "DOSING_JOBS", "NAMES", "PUMPS", "SPARE", "Cluster", "Event", "Mailbox", "Pin", "Reading"]
-
 KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
 MOST_ML = 100.0  # no event tells more: half a second of a pump, or what a pump gave that stood still
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will

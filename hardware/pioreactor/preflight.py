@@ -14,8 +14,6 @@ from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.versions import TESTED, facts, flow
 from hardware.pioreactor.web import Barrier, Web
 
-__all__ = ["preflight"]
-
 QUEUE_S = 20.0
 
 

@@ -25,8 +25,6 @@ from hardware.pioreactor.messages import NotHeard
 from hardware.pioreactor.versions import Facts, flow
 from hardware.pioreactor.web import PROBE_S, Barrier, Calls, Web
 
-__all__ = ["LATE_ML", "OURS", "Moved", "Pumps", "Request", "Seen", "Steps", "Unit", "boot_of", "is_off"]
-
 T = TypeVar("T")
 
 OURS = "turbidostat/"

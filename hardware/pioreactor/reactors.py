@@ -17,8 +17,6 @@ from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.web import Web
 from hardware.stations import Stations
 
-__all__ = ["PioreactorReactors"]
-
 LOOK_S, FIRST_S = 0.05, 30.0  # real seconds between two looks; until the broker answered
 
 screen = logging.getLogger(__name__)

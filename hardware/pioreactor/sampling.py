@@ -9,8 +9,6 @@ from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Reading
 from hardware.stations import Newest
 
-__all__ = ["UnitSampling"]
-
 FEWEST = 2  # readings of a sample
 DARK = 5.0  # counts, below which the interlock calls a light sensor failed
 COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt

@@ -20,8 +20,6 @@ from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts
 from hardware.pioreactor.web import Barrier, Calls
 from hardware.stations import Plan, Station
 
-__all__ = ["PioreactorStation"]
-
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
 RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended

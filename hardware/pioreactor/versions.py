@@ -8,8 +8,6 @@ from typing import Any
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.messages import NotCalibrated
 
-__all__ = ["GONE", "TESTED", "Facts", "facts", "flow", "number", "regulates", "request", "target_of"]
-
 TESTED = ("25.11.19", "26.7.2", "26.11.1")  # versions that the tests run against
 OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring", "dosing_automation"
 Asked = tuple[dict[str, Any], list[list[str]]]

@@ -16,8 +16,6 @@ from hardware.link.http import fetch
 from hardware.pioreactor import messages
 from hardware.pioreactor.messages import NotHeard
 
-__all__ = ["PROBE_S", "Barrier", "Calls", "Web"]
-
 T = TypeVar("T")
 
 PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused

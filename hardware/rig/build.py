@@ -12,8 +12,6 @@ from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED
 from hardware.pioreactor.versions import TESTED, number
 
-__all__ = ["CACHE", "broker", "environment", "home", "missing", "newer", "version"]
-
 CACHE = Path("~/.cache/turbidostat/pioreactor").expanduser()
 PYTHONS = ("python3.13", "python3.14", "python3.12")
 

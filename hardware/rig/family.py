@@ -11,8 +11,6 @@ from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitC
 from hardware.pioreactor.family import PioreactorFamily
 from hardware.rig.processes import Rig
 
-__all__ = ["FAMILY", "RigFamily"]
-
 log = logging.getLogger(__name__)
 
 

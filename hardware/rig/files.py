@@ -9,8 +9,6 @@ from typing import Any
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.versions import Facts
 
-__all__ = ["LOGIN", "PINS", "database", "flows", "layout", "model", "wrapper"]
-
 AT = "2026-01-01T00:00:00.000Z"  # when all of this was made
 
 LOGIN = ("pioreactor", "raspberry")  # of the broker, as the vendor ships it

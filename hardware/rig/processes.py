@@ -23,8 +23,6 @@ from hardware.rig.build import broker, environment, version
 from hardware.rig.files import LOGIN, database, flows, layout, model, wrapper
 from hardware.rig.vials import VialServer, vial_preset
 
-__all__ = ["Rig"]
-
 WEB = (
     "import os, pioreactor.web.app as web\n"
     "if hasattr(web, 'client'):\n"

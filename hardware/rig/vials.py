@@ -19,8 +19,6 @@ from envs.plant.plant import Plant, PlantConfig
 from hardware.pioreactor.config import vial_ml
 from hardware.rig.files import PINS, flows
 
-__all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
-
 VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with the reference at 0.1 V one unit of the reading is one OD
 PUMPS = {PINS[pump]: pump for pump in ("media", "alt_media", "waste")}  # a pin stays on when its process is killed
 MEDIA, ALT, WASTE = PUMPS

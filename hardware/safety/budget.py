@@ -11,8 +11,6 @@ from hardware.safety import messages
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
 
-__all__ = ["FeedBudget"]
-
 
 class FeedBudget:
     """Feed of N reactors over the last minute, the last hour and the run, and the volume it leaves in the vial.

@@ -9,10 +9,6 @@ from envs.bench import Bench
 from hardware.messages import Fault
 from hardware.safety.messages import BudgetFault, FallsFault, FluorescenceLostFault, JumpFault, NoDilutionFault
 
-__all__ = [
-    "DONE", "MAX_SETPOINT", "RAW_MAX", "RAW_MIN", "WORDS", "Response", "Responses", "SafetyConfig",
-]  # fmt: skip
-
 
 class Response(IntEnum):
     """What is to be done with a reactor, in order of severity.

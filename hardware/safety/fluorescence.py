@@ -9,8 +9,6 @@ from hardware.safety import messages
 from hardware.safety.config import RAW_MAX, SafetyConfig
 from hardware.safety.readings import Finding
 
-__all__ = ["Light"]
-
 
 class Light:
     """Plausibility of the newest fluorescence of N reactors, where it is measured; it is no basis of a dose."""

@@ -28,8 +28,6 @@ from hardware.safety.messages import PAUSES
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
-__all__ = ["Interlock", "Ruling", "kinds_of"]
-
 
 @dataclass(frozen=True)
 class Ruling:

@@ -11,8 +11,6 @@ from hardware.reactor import Array, Mask, Measurement
 from hardware.safety import messages
 from hardware.safety.config import RAW_MAX, RAW_MIN, SafetyConfig
 
-__all__ = ["Finding", "Heat", "Readings"]
-
 FROZEN_SAMPLES = 3  # equal readings in a row that no noisy sensor gives
 HOT_EXCESS_C = 2.0  # above the thermostat's target, in three samples
 MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples

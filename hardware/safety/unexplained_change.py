@@ -9,8 +9,6 @@ from hardware.safety import messages
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
 
-__all__ = ["UnexplainedChange"]
-
 GAIN_MIN, GAIN_MAX = 0.5, 1.6  # least and most that a dose delivers, of what its calibration says
 ACCEPT_UP, ACCEPT_DOWN = 6, 3  # consistent readings after which a step is believed; bubbles last up to five
 PERSISTENCE = 3  # samples in a row

@@ -5,8 +5,6 @@ import secrets
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["sync_folder", "write"]
-
 
 def write(path: Path, data: bytes | str, fsync: bool = True) -> None:
     """Replace the content of `path` in one step: nobody ever reads half a file. Text is written as UTF-8.

@@ -13,8 +13,6 @@ from typing import Any, Self
 from hardware.errors import RecordingError
 from hardware.storage.messages import RowDamaged
 
-__all__ = ["REPEAT_S", "Dosed", "Ending", "Given", "damaged", "dosed", "feeds_by"]
-
 REPEAT_S = 63.0
 """A row tells repetitions of a dose by their number, each so long after the one before: the period of a Chi.Bio."""
 FEEDS = {"Pump1": 1, "Pump3": 3, "Pump4": 4}  # pumps that an intent may name, and their numbers

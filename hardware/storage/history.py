@@ -7,8 +7,6 @@ from typing import Any, ClassVar, Self
 
 from hardware.storage.doses import damaged
 
-__all__ = ["History"]
-
 
 @dataclass(frozen=True)
 class History:

@@ -15,8 +15,6 @@ from hardware.errors import RecordingError
 from hardware.storage import messages
 from hardware.storage.atomic import sync_folder
 
-__all__ = ["Journal", "plain", "read_journal"]
-
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(

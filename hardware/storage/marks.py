@@ -13,8 +13,6 @@ from pathlib import Path
 from hardware.storage.messages import MarksDamaged
 from hardware.storage.recorder import Recorder
 
-__all__ = ["NAME", "Mark", "add_mark", "read_marks"]
-
 NAME = "marks.csv"
 MEASURED = ("level_ml", "share", "sd", "bottle_ml")
 COLUMNS = ("time_min", "reactor", "text", "written", *MEASURED)

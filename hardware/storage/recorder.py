@@ -14,8 +14,6 @@ from pathlib import Path
 from hardware.storage.atomic import sync_folder
 from hardware.storage.messages import NotOpened, NotRecording, NotWritten, TornLine, WrongRow
 
-__all__ = ["Recorder"]
-
 Value = float | int | str | bool | None
 
 

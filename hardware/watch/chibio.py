@@ -20,8 +20,6 @@ from hardware.reactor import Measurement, Vitals
 from hardware.watch import messages
 from hardware.watched import Watched
 
-__all__ = ["WatchedChiBio"]
-
 AGAIN_S = 20.0  # from one `measure` without a sample to the next
 CYCLE_S = 56.0  # sooner no sample follows another
 

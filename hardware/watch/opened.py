@@ -18,8 +18,6 @@ from hardware.watch.chibio import WatchedChiBio
 from hardware.watch.pioreactor import WatchedPioreactors
 from hardware.watched import Watched
 
-__all__ = ["WatchedFamily"]
-
 KINDS = ("chibio", "pioreactor")
 
 

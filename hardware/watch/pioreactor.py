@@ -12,8 +12,6 @@ from hardware.reactor import Measurement, Vitals
 from hardware.watch.messages import NoReading
 from hardware.watched import Watched
 
-__all__ = ["WatchedPioreactors"]
-
 LOOK_S, FIRST_S, AGAIN_S = 0.05, 30.0, 20.0  # real s: between two looks; until the broker answers; of a `measure`
 REST_S = 15.0  # after a dose until readings count again: pumps, stirring
 SILENT_S = 45.0  # without a reading

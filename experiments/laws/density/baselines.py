@@ -8,8 +8,6 @@ from conf.schema import require, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-__all__ = ["GainScheduled", "GainScheduledConfig", "Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
-
 LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this value, which has a logarithm
 
 

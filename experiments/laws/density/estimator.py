@@ -11,8 +11,6 @@ from conf.schema import check, setting
 from envs.task import EnvConfig
 from experiments.laws.base import Array, Mask, usable
 
-__all__ = ["Estimator", "EstimatorConfig", "fixed"]
-
 USUAL = 0.75  # mean square of an innovation on a sound reactor
 SHARE_SD = 0.02  # change of the growth share at rest besides the filter's error of it
 LOG_OD, MU, GAIN, WARMTH = range(4)

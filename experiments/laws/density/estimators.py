@@ -12,8 +12,6 @@ from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, W
 from experiments.laws.density.estimator import Estimator, EstimatorConfig, fixed
 from hardware.memory import Remembers
 
-__all__ = ["DensityEstimator", "WithEstimator", "add", "build", "config_at", "settings"]
-
 
 class DensityEstimator(Remembers, Protocol):
     """Estimates of error e = ln(x/r)/B and growth share s = mu h/B of N vials (`envs/relative.py`), structurally.

@@ -12,8 +12,6 @@ from experiments.laws.base import Array, ControllerConfig, Mask, usable
 from experiments.laws.density import estimators
 from experiments.laws.density.estimator import EstimatorConfig
 
-__all__ = ["Inverse", "InverseConfig"]
-
 
 @dataclass(frozen=True)
 class InverseConfig(ControllerConfig):

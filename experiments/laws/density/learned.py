@@ -15,8 +15,6 @@ from experiments.laws.base import Array, Controller, ControllerConfig, Mask, usa
 from experiments.laws.density import estimators
 from experiments.laws.density.estimator import EstimatorConfig
 
-__all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
-
 WATCHED = 2.0  # number of sd that count as the error of an estimate
 LOUDER = 1.5  # loudness of the policy's filter over that of the second one, above which the second one knows better
 NOTED = 36.0  # loudness that is worth a note, whoever knows better

@@ -9,8 +9,6 @@ from conf.schema import check, part, require, setting
 from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-__all__ = ["Mpc", "MpcConfig", "Problem", "SwarmConfig", "minimise"]
-
 LOWEST_OD = 1e-3  # a lower reading counts as this: the model cannot grow from zero
 
 

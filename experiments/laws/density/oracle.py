@@ -11,8 +11,6 @@ from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask
 
-__all__ = ["Oracle", "OracleConfig"]
-
 SECONDS = 60.0  # per min
 SPAN = (0.05, 4.0)  # OD over setpoint that the value function covers
 GRID = 3001

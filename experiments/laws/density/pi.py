@@ -9,8 +9,6 @@ from envs.bench import Bench
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-__all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
-
 ASSUMED_FLOW_ML_S = 4.0  # pump flow assumed by the device's controller; real pumps: about 1 (docs/biology.md, Pumps)
 LOWEST_OD = 1e-6  # the device uses this for a setpoint of 0 or less
 
