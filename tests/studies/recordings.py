@@ -31,10 +31,12 @@ from tests.studies.supervision import shipped
 log = logging.getLogger(__name__)
 
 EYESPY: dict[str, Any] = {"columns": {"od": "Eyespy_sct_V", "fed": "pump_inflow_time_s"}, "pump_ml_s": 1 / 75}
+TURBIDOSTAT: dict[str, Any] = {"columns": {"od": "neph", "fed": "pumptime.s"}, "pump_ml_s": 0.252 * 20 / 189}
 SOURCES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "lanl/chemostat_regression": ("lanl/**/example_data.csv", "LICENSE file", {}),
     "livingphysics/bioreactor_v3": ("livingphysics/[be]*_data.csv", "no file", EYESPY),
     "ariellangevin/eVOLVER_data-analysis": ("evolver/**/OD/*_OD.txt", "no file", {"pump_ml_s": 0.8}),
+    "ingolia-lab/turbidostat": ("ingolia/**/tstat.txt", "no file", TURBIDOSTAT),
     "gchure/diauxic_flux_parity": ("gchure/**/raw/*data.csv", "LICENSE file", {}),
     "nahanoo/ChiBioFlow": ("chibioflow/**/*_data.csv", "LICENSE file", {}),
 }
@@ -79,7 +81,15 @@ def recordings(config: RecordingsConfig, folder: Path) -> None:
     """A row for each recording, a table for each source."""
     page, rows = Page("On other labs' recordings", "predicted and replayed by the policy that ships"), []
     page.section("Recordings")
-    columns = ("recording", "h", "inside 95 %, %", "ten ahead, %", "not believed, %", "filter alarm, %", "calibrate")
+    columns = (
+        "recording",
+        "h",
+        "innovations inside 95 %, %",
+        "ten ahead, %",
+        "not believed, %",
+        "filter alarm, %",
+        "calibrate",
+    )
     for name, (pattern, licence, options) in SOURCES.items():
         mine = []
         for path in sorted(Path(config.folder).glob(pattern))[: config.most]:
