@@ -10,10 +10,9 @@ from pathlib import Path
 
 from envs.identification.calibration import calibrate
 from envs.identification.model import NotIdentifiable
-from envs.identification.refusal import growth_alone
 from envs.identification.screening import Series, merged
 from envs.identification.twin import Twin, twin
-from envs.identification.verdict import Calibration
+from envs.identification.verdict import Calibration, growth_alone
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml, refusal, summary, twin_yaml
 from experiments.calibration.study import coverage, simulated

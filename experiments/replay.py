@@ -26,7 +26,7 @@ from experiments.laws import registry
 from experiments.laws.base import Array, Controller
 from experiments.laws.density.learned import LearnedConfig
 from experiments.loop.loop import ClosedLoop
-from experiments.recordings.config import Source
+from experiments.recordings.reader import Source
 from experiments.replays.replay import AHEAD, Replayed, replay
 from hardware.errors import RecordingError
 from hardware.safety.config import SafetyConfig

@@ -15,10 +15,9 @@ from envs.identification.drift import NOTABLE_DRIFT_PCT, choose_window, drift, l
 from envs.identification.free_run import Fit, fit
 from envs.identification.model import NotIdentifiable, Parameter, check_excitation, pmse, trajectory
 from envs.identification.prediction_error import enough, estimate, outliers
-from envs.identification.refusal import check_estimate
 from envs.identification.screening import Rejection, Screened, Series, noise_sd, screen
 from envs.identification.validation import attainable_pct, validate
-from envs.identification.verdict import Calibration, Verdict, judged
+from envs.identification.verdict import Calibration, Verdict, check_estimate, judged
 
 __all__ = ["Calibration", "IdentifyConfig", "calibrate"]
 

@@ -285,7 +285,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
 
     Args: parts: screened series; readings may be nan, time and pump count throughout. rounds: points of the noise
       model; QUICK for many short parts whose single intervals decide nothing. seed: of the points.
-    Returns: one `Estimate` each; check it by `refusal.check_estimate`.
+    Returns: one `Estimate` each; check it by `verdict.check_estimate`.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)

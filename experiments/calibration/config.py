@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from conf.schema import part, require, setting
 from envs.identification.calibration import IdentifyConfig
 from envs.identification.open_loop import OpenLoop
-from experiments.recordings.config import Source
+from experiments.recordings.reader import Source
 
 LAWS = ("open_loop", "pi", "pi_tuned", "threshold", "proportional")
 

@@ -50,7 +50,8 @@ class Layout:
 
     od: None in a table of doses. fed: columns of pumps that feed, or of doses. feed: what they hold: a "rate" in mL/s,
     a "dose" in mL, the "total" of the doses so far, or nothing, "". idle: of pumps that are not counted, by number.
-    light: of the factors that make fluorescence. minutes: nan where the column's name tells no unit. labels: of words
+    light: of the factors that make fluorescence. timed: a dose is the seconds that a pump ran.
+    minutes: nan where the column's name tells no unit. labels: of words
     that tell rows apart, by what they name: reactor, experiment, channel, event.
     """
 
@@ -66,6 +67,7 @@ class Layout:
     idle: dict[int, int] = field(default_factory=dict)
     labels: dict[str, int] = field(default_factory=dict)
     light: tuple[int, ...] = ()
+    timed: bool = False
 
     @property
     def numbers(self) -> list[int]:
@@ -85,7 +87,7 @@ def recognised(path: Path, first: Sequence[str], named: bool, asked: Asked, dose
             raise RecordingError(f"{path}: an eVOLVER's OD without its pump log; give doses=.../vial0_pump_log.txt")
         fed: tuple[int, ...] = (1,) if doses else ()
         od, feed = (None, "dose") if doses else (1, "")
-        return Layout("eVOLVER", 0, od, None, fed, feed, UNITS["h"], asked.pump_ml_s, list(first))
+        return Layout("eVOLVER", 0, od, None, fed, feed, UNITS["h"], asked.pump_ml_s, list(first), timed=doses)
     if named:
         return _named(path, first, asked, doses, alone)
     if len(first) == 3:
@@ -119,7 +121,7 @@ def _named(path: Path, first: Sequence[str], asked: Asked, doses: bool, alone: b
     at, times = names.index, [name for name in names if TIME.fullmatch(name)]
     time = needed("time", "time", sorted(times, key=lambda name: not _unit(name)) or ["time_min", "time_s", "time_h"])
     od = None if doses else needed("od", "OD", OD)
-    fed, feed, ml, idle = _feed(path, names, found, asked, own)
+    fed, feed, unit, idle = _feed(path, names, found, asked, own)
     if not fed and (doses or alone):
         needed("rate", "pump rate or doses", (DUTY.format(1), *PUMP, *DOSE, *FED))
     temperature, reactor = found("temperature", TEMPERATURE), found("reactor", REACTOR)
@@ -132,9 +134,10 @@ def _named(path: Path, first: Sequence[str], asked: Asked, doses: bool, alone: b
         fed=fed,
         feed=feed,
         minutes=UNITS.get(asked.time_unit or _unit(time), math.nan),
-        ml=ml,
+        ml={"ul": 1e-3, "s": asked.pump_ml_s}.get(unit, 1.0),
         header=list(first),
         idle=idle,
+        timed=unit == "s",
         labels=labels | ({"reactor": at(reactor[0])} if reactor else {}),
         light=next((tuple(map(at, columns)) for columns in LIGHT if set(columns) <= set(names)), ()),
     )
@@ -142,19 +145,19 @@ def _named(path: Path, first: Sequence[str], asked: Asked, doses: bool, alone: b
 
 def _feed(
     path: Path, names: Sequence[str], found: Callable[[str, Iterable[str]], list[str]], asked: Asked, own: Iterable[str]
-) -> tuple[tuple[int, ...], str, float, dict[int, int]]:
-    """Places and kind of what was fed, its factor to mL or mL/s, and the pumps that are not counted."""
+) -> tuple[tuple[int, ...], str, str, dict[int, int]]:
+    """Places and kind of what was fed, its unit, and the pumps that are not counted."""
     duties = {pump: names.index(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
     if duties and not {"rate", "dose", "fed"} & {*own}:
         fed, idle = _feeding(path, duties, asked.pumps)
-        return fed, "rate", asked.pump_ml_s, idle
+        return fed, "rate", "s", idle
     known = (("rate", "rate", (DUTY.format(1), *PUMP)), ("dose", "dose", DOSE), ("fed", "total", FED))
     for key, feed, usual in sorted(known, key=lambda one: one[0] not in own):
         if some := found(key, usual):
             unit = "" if feed == "rate" else some[0].rpartition("_")[2]
-            factor = {"ul": 1e-3, "s": asked.pump_ml_s}.get(SPELT.get(unit, unit), 1.0)
-            return tuple(names.index(name) for name in some[: 1 if feed == "rate" else None]), feed, factor, {}
-    return (), "", 1.0, {}
+            places = tuple(names.index(name) for name in some[: 1 if feed == "rate" else None])
+            return places, feed, SPELT.get(unit, unit), {}
+    return (), "", "", {}
 
 
 def _feeding(path: Path, at: dict[int, int], pumps: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:

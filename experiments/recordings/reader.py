@@ -4,22 +4,24 @@
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from experiments.recordings.layout import Asked, Layout, Rows
+from conf.schema import check, require, setting
+from experiments.recordings.layout import COLUMNS, UNITS, Asked, Layout, Rows
 from experiments.recordings.table import MIN_ROWS, Cells, named_rows, read_table
 from hardware.errors import RecordingError
 
-__all__ = ["Recording", "read_recording"]
+__all__ = ["Recording", "Source", "read_recording"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -80,12 +82,8 @@ def read_recording(
 ) -> Recording:
     """Read a recording from a device's own file, from `Recorder`'s, or from a table.
 
-    Known layouts: the Chi.Bio's named columns (exp_time in s, od_measured, pump_1_rate as a share of full power), the
-    same without header (known by position), any file with columns such as time_min, od, and pump_rate_ml_s, dose_ml or
-    fed_ml, three bare columns minutes, OD, mL/s, a Pioreactor's export (zip) or one of its tables, and an eVOLVER's OD
-    beside its pump log. In a file with doses a row is a reading, a dose or both, blank cells are allowed, and a dose
-    counts from the next reading on. Semicolon, tab, comma and blank separate; beside the first two a comma is decimal.
-    Time may be a date or count s or ms since 1970. The text is UTF-8 or UTF-16, plain or gzipped.
+    docs/calibration.md (What it reads) has the layouts. In a file with doses a row is a reading, a dose or both, blank
+    cells are allowed, and a dose counts from the next reading on.
 
     Args:
       path: of the file.
@@ -266,3 +264,58 @@ def _note(notes: list[str], rows: Numbers, what: str) -> None:
     """Add one sentence that names the rows it concerns."""
     if len(rows):
         notes.append(f"{named_rows(rows)}: {what}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a recording is, and what a command is told of it."""
+
+    data: str | None = setting(
+        None,
+        "recording: CSV of a Chi.Bio, of this project or of a lab, a Pioreactor's export (zip) or one of its tables, "
+        "an eVOLVER's OD; null: the simulated recording of the project",
+    )
+    doses: str | None = setting(
+        None, "second file, with the doses: an eVOLVER's pump log, a Pioreactor's dosing_events"
+    )
+    columns: dict[str, Any] = setting(
+        {}, f"names in the file that are not understood: columns.od=NAME, also {', '.join(COLUMNS)}"
+    )
+    time_unit: str | None = setting(
+        None, "of times without date whose column names no unit, or a wrong one", choices=tuple(UNITS)
+    )
+    rows: str | None = setting(None, "FIRST:END, data rows from 0, without END; null: all")
+    run: int | None = setting(None, "run in a file of several concatenated runs, from 0; null: the longest")
+    reactor: str | None = setting(None, "reactor in a file with several of them; null: the first")
+    pump_ml_s: float = setting(
+        1.0,
+        "flow of the feed pump at full power, where a file holds a Chi.Bio's duties or the seconds that a pump ran",
+        "mL/s",
+        above=0.0,
+        at_most=10.0,
+    )
+    pumps: tuple[int, ...] = setting(
+        (1,), "pumps in the Chi.Bio's CSV that feed the vial (1 to 4); their flows are added", within=(1, 4), some=True
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        spans = self.rows is None or re.fullmatch(r"\d*:\d*", self.rows)
+        require(bool(spans), "rows", self.rows, "FIRST:END, e.g. 0:700 (data rows from 0, END excluded)")
+        for key in self.columns:
+            require(key in COLUMNS, f"columns.{key}", self.columns[key], ", ".join(f"columns.{one}" for one in COLUMNS))
+
+    def read(self, path: str) -> Recording:
+        """Read a file as it is told here. Raises: RecordingError."""
+        first, end = (self.rows or ":").split(":")
+        return read_recording(
+            path,
+            pump_ml_s=self.pump_ml_s,
+            pumps=self.pumps,
+            run=self.run,
+            reactor=self.reactor,
+            rows=(int(first or 0), int(end) if end else None),
+            doses=self.doses,
+            columns={key: str(name) for key, name in self.columns.items()},
+            time_unit=self.time_unit,
+        )

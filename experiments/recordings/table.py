@@ -25,6 +25,7 @@ Numbers = NDArray[np.int64]
 EPOCHS = ((1e11, 6e4, "counts ms since 1970"), (1e9, 60.0, "is a date or counts s since 1970"))  # from, per min, words
 MIN_ROWS = 10
 LARGEST_ML = 50.0  # of a dose
+LONGEST_S = 1e6  # of all runs of a pump
 
 
 class Cells(NamedTuple):
@@ -71,6 +72,8 @@ def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -
         raise RecordingError(f"{path}: holds what was fed, and doses={doses} holds it again; drop one of them")
     table, since_1970 = _in_house_units(path, layout, read, keep, notes)
     events = None
+    if layout.timed and layout.feed != "rate" and (np.diff(table.time_min) >= 0.0).all():
+        events = _spread(path, layout, table)
     if not layout.feed:
         events = _events(doses or path, asked, read.words(layout, "reactor", keep), since_1970, notes)
     if layout.feed != "rate":
@@ -216,14 +219,28 @@ def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, not
     table, dated = _in_house_units(path, layout, read, keep, [])
     if dated != since_1970 and len(table.od):
         raise RecordingError(f"{path}: counts its time another way than the readings; dates in both, or in neither")
-    order = np.argsort(table.time_min, kind="stable")
-    return table.time_min[order], table.pump_rate[order]
+    return _spread(path, layout, table)
+
+
+def _spread(path: Path, layout: Layout, table: Cells) -> tuple[Array, Array]:
+    """Return minutes and mL of doses in order of time, the seconds that a pump ran in parts of one second.
+
+    Raises: RecordingError.
+    """
+    _check_doses(path, table.pump_rate)
+    seconds = np.nan_to_num(np.ceil(table.pump_rate / layout.ml)) if layout.timed else np.zeros(len(table.od))
+    parts = np.maximum(seconds if seconds.sum() < LONGEST_S else 1.0, np.ones(len(seconds))).astype(np.int64)
+    later = (np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)) / 60.0
+    time, ml = np.repeat(table.time_min, parts) + later, np.repeat(table.pump_rate / parts, parts)
+    order = np.argsort(time, kind="stable")
+    return time[order], ml[order]
 
 
 def _with_rates(path: Path, table: Cells, events: tuple[Array, Array] | None) -> Cells:
     """Turn doses into the mean rate from each reading to the next; rows without a reading go.
 
-    A dose counts from the next reading on; so does what a row's total has grown by.
+    A dose counts from the next reading on; so does what a row's total has grown by. The seconds that a pump ran begin
+    with their row.
     """
     is_reading = np.isfinite(table.od) & np.isfinite(table.time_min)
     is_reading[1:] &= np.diff(table.time_min) != 0.0
@@ -233,7 +250,8 @@ def _with_rates(path: Path, table: Cells, events: tuple[Array, Array] | None) ->
     dose = table.pump_rate
     if events is not None:
         at, dose = np.searchsorted(readings.time_min, events[0], side="right") - 1, events[1]
-    _check_doses(path, dose)
+    else:
+        _check_doses(path, dose)
     ml = np.bincount(at[at >= 0], dose[at >= 0], len(readings.od))
     lasts = np.append(np.diff(readings.time_min), -1.0)
     with np.errstate(divide="ignore"):

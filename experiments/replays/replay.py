@@ -96,8 +96,8 @@ def replay(
     schedule = Scenario((setpoint,), (series.time[-1] + 1.0,), (warm,))
     loop = ClosedLoop(device, law, interlock, schedule, at_end="hold", model=model)
     apart = np.diff(series.time, append=series.time[-1] + interlock.bench.control_min)
-    found = {key: np.full(n, np.nan) for key in ("rate", "believed", "mu", "gain", "alarm")}
-    ahead, reasons = np.full((2, n + AHEAD, 2), np.nan), []
+    found = {key: np.full(n, np.nan) for key in ("rate", "believed", "mu", "gain", "alarm", "square")}
+    ahead, reasons = np.full((n + AHEAD, 2), np.nan), []
     for k in range(n):
         step = loop.step()
         known: dict[str, Any] = step.explanation | {"rate": step.rate, "believed": step.believed}
@@ -107,15 +107,13 @@ def replay(
         if isinstance(law.estimator, Estimator) and known["believed"][0]:
             steps = slice(k, min(k + AHEAD, n - 1))
             expected = law.estimator.ahead(apart[steps], device.fed_ml[steps])
-            if len(expected):
-                ahead[0, k + 1] = expected[0]
+            found["square"][k] = law.estimator.square[0]
             if len(expected) == AHEAD:
-                ahead[1, k + AHEAD] = expected[-1]
+                ahead[k + AHEAD] = expected[-1]
     believed = found["believed"] > 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(np.log(np.maximum(series.od, FIXED.lowest_od)) - ahead[:, :n, 0]) / ahead[:, :n, 1]
-    one, ten = np.where(np.isfinite(off) & believed, off <= INSIDE, np.nan)
-    middle, sd = ahead[1, :n].T
+    middle, sd = ahead[:n].T
+    off = (np.log(np.maximum(series.od, FIXED.lowest_od)) - middle) / sd
+    one, ten = (np.where(np.isfinite(z) & believed, z <= INSIDE**2, np.nan) for z in (found["square"], off**2))
     return Replayed(
         setpoint, series.time, series.od, believed, 60.0 * found["rate"] * apart,
         np.append(device.fed_ml, 0.0), found["mu"], found["gain"], np.exp(middle - INSIDE * sd),

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
 from envs.identification.drift import Drift, Segment, cuts, drift
 from envs.identification.model import NotIdentifiable, Parameter
-from envs.identification.refusal import check_estimate, growth_alone
 from envs.identification.screening import WEEK_MIN, Series, merged
 from envs.identification.validation import Validation, attainable_pct
-from envs.identification.verdict import judged
+from envs.identification.verdict import check_estimate, growth_alone, judged
 from tests.studies.second_simulator import Conditions, simulate
 
 pytestmark = pytest.mark.numeric

@@ -26,7 +26,7 @@ from experiments.calibration.result import environment_yaml, summary
 from experiments.calibration.study import against_truth, simulated
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
-from experiments.recordings import config as source
+from experiments.recordings import reader as source
 from experiments.recordings.reader import Recording, read_recording
 from experiments.reporting import calibration_charts, charts, tensorboard
 from experiments.reporting.verdict import verdict

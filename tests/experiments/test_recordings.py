@@ -122,6 +122,20 @@ def test_every_format_tells_the_same_readings_and_doses(tmp_path: Path, form: st
     np.testing.assert_allclose(60.0 * r.pump_rate[:-1] * np.diff(r.time_min), DOSE[:-1], atol=1e-9)
 
 
+@pytest.mark.parametrize("form", ["beside", "dose", "fed"])
+def test_a_dose_in_seconds_of_a_pump_lasts_so_long(tmp_path: Path, form: str) -> None:
+    """A reading every 10 s: 25 s from a reading on are in three rows, and their volume is kept."""
+    rows = [[f"{10 * k}", "0.5", f"{25.0 * (k >= 5) if form == 'fed' else 25.0 * (k == 5)}"] for k in range(20)]
+    given: dict[str, Any] = {"data": csv([["time_s", "od", "pump_s"], *rows]), "columns": {form: "pump_s"}}
+    if form == "beside":
+        hours = [f"{int(t) / 3600:.9f}" for t, *_ in rows]
+        head = log(OD)[:1]
+        given = {"data": csv(head + [[t, "0.5"] for t in hours]), "doses": csv([*head, [hours[5], "25.0"]])}
+    r = read(tmp_path, pump_ml_s=0.8, **given)
+    np.testing.assert_allclose(10.0 * r.pump_rate[5:8], [8.0, 8.0, 4.0], atol=0.81)
+    assert 10.0 * r.pump_rate.sum() == pytest.approx(20.0)
+
+
 def column(change: Callable[[float], float], *names: str) -> Callable[[Table], Table]:
     """Change the numbers of the columns with these names; of a table without names the first or the second."""
 

@@ -31,10 +31,12 @@ from tests.studies.supervision import shipped
 log = logging.getLogger(__name__)
 
 EYESPY: dict[str, Any] = {"columns": {"od": "Eyespy_sct_V", "fed": "pump_inflow_time_s"}, "pump_ml_s": 1 / 75}
+TURBIDOSTAT: dict[str, Any] = {"columns": {"od": "neph", "fed": "pumptime.s"}, "pump_ml_s": 0.252 * 20 / 189}
 SOURCES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "lanl/chemostat_regression": ("lanl/**/example_data.csv", "LICENSE file", {}),
     "livingphysics/bioreactor_v3": ("livingphysics/[be]*_data.csv", "no file", EYESPY),
     "ariellangevin/eVOLVER_data-analysis": ("evolver/**/OD/*_OD.txt", "no file", {"pump_ml_s": 0.8}),
+    "ingolia-lab/turbidostat": ("ingolia/**/tstat.txt", "no file", TURBIDOSTAT),
     "gchure/diauxic_flux_parity": ("gchure/**/raw/*data.csv", "LICENSE file", {}),
     "nahanoo/ChiBioFlow": ("chibioflow/**/*_data.csv", "LICENSE file", {}),
 }
@@ -48,20 +50,22 @@ class RecordingsConfig:
 
     folder: str = setting("", "with the files of each source")
     most: int = setting(1000, "of one source", within=(1, 1000))
+    hours: float = setting(1000.0, "of each from its first row", "h", within=(1, 1000))
 
     def __post_init__(self) -> None:
         check(self)
 
 
-def row(name: str, r: Recording) -> tuple[str, ...]:
+def row(name: str, r: Recording, hours: float) -> tuple[str, ...]:
     """What a replay with the policy that ships and a calibration come to."""
     raw = Series(r.time_min - r.time_min[0], r.od, r.pump_rate, r.row)
+    raw = raw.part(0, int(np.searchsorted(raw.time, 60.0 * hours)))
     fast = float(np.median(np.diff(raw.time))) < 0.5
     series = merged(raw, longest=0) if fast else raw
     bench = Bench(period_s=round(60.0 * float(np.median(np.diff(series.time))), 3))
     law = shipped()
     setpoint = float(np.clip(np.nanmedian(series.od), 0.02, 1.5))
-    warm = np.interp(series.time, raw.time, r.temperature)
+    warm = np.interp(series.time, raw.time, r.temperature[: len(raw.time)])
     found = replay(series, warm, law, WatchedInterlock(1, SafetyConfig(), bench), setpoint, EnvConfig())
     try:
         result = calibrate(merged(raw))
@@ -79,7 +83,15 @@ def recordings(config: RecordingsConfig, folder: Path) -> None:
     """A row for each recording, a table for each source."""
     page, rows = Page("On other labs' recordings", "predicted and replayed by the policy that ships"), []
     page.section("Recordings")
-    columns = ("recording", "h", "inside 95 %, %", "ten ahead, %", "not believed, %", "filter alarm, %", "calibrate")
+    columns = (
+        "recording",
+        "h",
+        "innovations inside 95 %, %",
+        "ten ahead, %",
+        "not believed, %",
+        "filter alarm, %",
+        "calibrate",
+    )
     for name, (pattern, licence, options) in SOURCES.items():
         mine = []
         for path in sorted(Path(config.folder).glob(pattern))[: config.most]:
@@ -87,7 +99,9 @@ def recordings(config: RecordingsConfig, folder: Path) -> None:
             more = options if doses == path else {**options, "doses": doses}
             try:
                 r = read_recording(path, **more)
-                mine.append(row(path.stem, r) if len(r.od) >= FEWEST else (path.stem, *["–"] * 5, "too short"))
+                mine.append(
+                    row(path.stem, r, config.hours) if len(r.od) >= FEWEST else (path.stem, *["–"] * 5, "too short")
+                )
             except RecordingError as error:
                 mine.append((path.stem, *["–"] * 5, f"refused: {str(error).partition(': ')[2][:60]}"))
             log.info("%s", "  ".join(mine[-1]))

@@ -268,6 +268,11 @@ class Estimator:
         return np.asarray(np.nansum(self._squares[:, -FIXED.last :], axis=1))
 
     @property
+    def square(self) -> Array:
+        """Square of the newest innovation in units of its sd, at most 9, (N,); nan before the second reading."""
+        return np.asarray(self._squares[:, -1])
+
+    @property
     def loud(self) -> NDArray[np.bool_]:
         return np.asarray(self.loudness > FIXED.loud)
 
