@@ -21,8 +21,6 @@ from envs.identification.drift import NOTABLE_DRIFT_PCT, SHORTEST_WINDOW_MIN, Dr
 from envs.identification.model import MIN_READINGS, Parameter
 from envs.identification.screening import OD_FLOOR, Screened, Series, screen
 
-__all__ = ["Agreement", "Compared", "agreement"]
-
 Array = NDArray[np.float64]
 
 LAGS = 10  # rows over which errors are correlated: noise of a reading is in two of them

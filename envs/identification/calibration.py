@@ -19,8 +19,6 @@ from envs.identification.screening import Rejection, Screened, Series, noise_sd,
 from envs.identification.validation import attainable_pct, validate
 from envs.identification.verdict import Calibration, Verdict, check_estimate, judged
 
-__all__ = ["Calibration", "IdentifyConfig", "calibrate"]
-
 Array = NDArray[np.float64]
 
 FLOOR_FACTOR = 3.0  # limit of a prediction error relative to noise and disturbances

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from envs.identification.model import Parameter
 from envs.identification.screening import Series, screen
 
-__all__ = ["Plateau", "Polynomial", "fit", "plateaus"]
-
 Array = NDArray[np.float64]
 
 HELD_C = 0.5  # a temperature within this of its running mean is constant

@@ -14,11 +14,6 @@ from envs.identification.noise_model import QUICK
 from envs.identification.prediction_error import enough, estimate
 from envs.identification.screening import FEWEST_READINGS, WEEK_MIN, Screened, Series
 
-__all__ = [
-    "SHORTEST_WINDOW_MIN", "Drift", "Segment", "choose_window", "cuts", "drift", "drifts", "longest", "pairs", "pieces",
-    "segments",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Pair = tuple[Parameter | None, Parameter | None]
 Window = tuple[int, int]

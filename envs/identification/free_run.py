@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from envs.identification.model import CONFIDENCE, WIDEST, WORST_CONDITION, NotIdentifiable, Parameter, pmse, trajectory
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume
 
-__all__ = ["Fit", "fit"]
-
 Array = NDArray[np.float64]
 
 HUBER_SD = 3.0

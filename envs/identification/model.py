@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from envs.identification.screening import Series, pumped_volume
 
-__all__ = ["REMEDY", "NotIdentifiable", "Parameter", "check_excitation", "pmse", "trajectory"]
-
 Array = NDArray[np.float64]
 
 MIN_READINGS = 20

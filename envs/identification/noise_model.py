@@ -25,8 +25,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FULL", "QUICK", "NoiseModel", "average", "effective"]
-
 Array = NDArray[np.float64]
 
 FULL = 10 * (128,)  # points of each round

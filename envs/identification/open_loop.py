@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from conf.schema import check, require, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
 
-__all__ = ["Decide", "OpenLoop", "OpenLoopLaw", "open_loop", "recordings"]
-
 Array = NDArray[np.float64]
 Decide = Callable[[float, Array], Array]
 """(minute, readings of shape (N,)) -> pump rates in mL/s, shape (N,), held to the next row."""

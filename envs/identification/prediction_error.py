@@ -28,8 +28,6 @@ from envs.identification.model import CONFIDENCE, Parameter
 from envs.identification.noise_model import FULL, QUICK, NoiseModel, average, effective
 from envs.identification.screening import FEWEST_READINGS, OD_FLOOR, Series, pumped_volume, running_median
 
-__all__ = ["Estimate", "Quality", "enough", "estimate", "outliers"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

@@ -15,11 +15,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-__all__ = [
-    "FEWEST_READINGS", "Rejection", "Screened", "Series", "merged", "noise_sd", "pumped_volume", "row_spans",
-    "running_median", "runs", "screen",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

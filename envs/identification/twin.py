@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.calibration import Calibration
 from envs.identification.model import Parameter
 from envs.identification.screening import OD_FLOOR, WEEK_MIN, Series
 from envs.identification.validation import START_READINGS
-
-__all__ = ["Course", "Noise", "Twin", "twin"]
+from envs.identification.verdict import Calibration
 
 Array = NDArray[np.float64]
 

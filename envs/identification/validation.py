@@ -12,8 +12,6 @@ from envs.identification.model import pmse, trajectory
 from envs.identification.prediction_error import Estimate, enough
 from envs.identification.screening import OD_FLOOR, Screened, Series, pumped_volume
 
-__all__ = ["Ahead", "Validation", "attainable_pct", "validate"]
-
 Array = NDArray[np.float64]
 
 START_READINGS = 5  # readings that set the start of a prediction and are not scored

@@ -13,8 +13,6 @@ from envs.identification.prediction_error import Estimate, Quality, enough, esti
 from envs.identification.screening import OD_FLOOR, Screened, Series, noise_sd, runs, screen
 from envs.identification.validation import START_READINGS, Validation
 
-__all__ = ["Calibration", "GrowthAlone", "Verdict", "check_estimate", "growth_alone", "judged"]
-
 Array = NDArray[np.float64]
 
 PLAUSIBLE_MU = (0.001, 0.06)  # 1/min, doubling in 11 h to 12 min

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from conf.schema import Entry, entries
 from envs.bench import Bench
-from envs.identification.calibration import Calibration
 from envs.identification.drift import Drift
 from envs.identification.model import NotIdentifiable, Parameter
 from envs.identification.screening import Series, row_spans
 from envs.identification.twin import Course, Twin
-from envs.identification.verdict import GrowthAlone, Verdict
+from envs.identification.verdict import Calibration, GrowthAlone, Verdict
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import PlantConfig
 from envs.plant.pump import PumpConfig

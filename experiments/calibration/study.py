@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
+from envs.identification.calibration import IdentifyConfig, calibrate
 from envs.identification.open_loop import Decide, OpenLoopLaw, recordings
 from envs.identification.screening import Series
+from envs.identification.verdict import Calibration
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.calibration.config import CalibrateConfig
 from experiments.cli import files

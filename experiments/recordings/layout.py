@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from hardware.errors import RecordingError
 
-__all__ = ["COLUMNS", "UNITS", "Asked", "Layout", "Rows", "recognised"]
-
 Rows = tuple[int, int | None]
 
 UNITS = {"s": 1 / 60, "min": 1.0, "h": 60.0}  # min

@@ -21,8 +21,6 @@ from experiments.recordings.layout import COLUMNS, UNITS, Asked, Layout, Rows
 from experiments.recordings.table import MIN_ROWS, Cells, named_rows, read_table
 from hardware.errors import RecordingError
 
-__all__ = ["Recording", "Source", "read_recording"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]

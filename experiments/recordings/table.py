@@ -16,8 +16,6 @@ from experiments.recordings import text
 from experiments.recordings.layout import Asked, Layout, recognised
 from hardware.errors import RecordingError
 
-__all__ = ["MIN_ROWS", "Cells", "named_rows", "read_table"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]

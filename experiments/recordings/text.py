@@ -17,8 +17,6 @@ from typing import IO, cast
 
 from hardware.errors import RecordingError
 
-__all__ = ["DOSED", "READ", "cells", "number", "readable", "zipped"]
-
 GZIP, ZIP = b"\x1f\x8b", b"PK"
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 TORN_LINES = 5  # so many lines with control characters are what power cuts leave; a file with more is binary

@@ -6,8 +6,6 @@ from experiments.laws.base import Array
 from experiments.replays.replay import AHEAD, Replayed
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
 
-__all__ = ["replay_figure", "twin_figure"]
-
 
 def replay_figure(found: Replayed, title: str) -> Figure:
     """OD with the band in which it was expected, growth, pump with alarms, and the doses of device and controller."""

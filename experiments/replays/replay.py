@@ -17,8 +17,6 @@ from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 from hardware.watched import Watched
 
-__all__ = ["AHEAD", "Replayed", "replay"]
-
 AHEAD = 10  # steps
 INSIDE = 1.96  # sd of a prediction that hold 95 % of readings
 

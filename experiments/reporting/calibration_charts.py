@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from envs.identification.agreement import Agreement, Compared
-from envs.identification.calibration import Calibration
 from envs.identification.drift import Segment
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.identification.twin import Twin
+from envs.identification.verdict import Calibration
 from experiments.reporting.charts import COLOURS, Array, new_figure
 
 DATA, MODEL, PUMP, REJECTED, UNUSED = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[3], "#a9b4bf"
