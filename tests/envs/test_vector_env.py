@@ -49,7 +49,7 @@ def test_the_optimums_actions_in_info_cost_what_the_optimum_costs():
         assert info["optimal_rate"] == env.unwrapped.config.pump_rates()[info["optimal_action"]]
         _, reward, _, over, info = env.step(info["optimal_action"])
         total += reward
-    assert total == pytest.approx(-np.sum((ods[:, 0] - best.setpoint) ** 2))
+    assert total == pytest.approx(-np.sum((ods[:, 0] - best.target) ** 2))
 
 
 def pair(n, mode, **overrides):
