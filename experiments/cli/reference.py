@@ -19,7 +19,7 @@ from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
-SHORT = 6  # values of a preset; longer ones stand in its file
+SHORT = 3  # values of a preset; longer ones stand in its file
 SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
