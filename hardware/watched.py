@@ -23,7 +23,7 @@ class WatchedSafety(SafetyConfig):
 
 
 class WatchedInterlock(Interlock):
-    """Tells of what lasts, and expects none of the doses that it allows. Arguments as of `Interlock`."""
+    """Interlock of a device that is only read: reports faults that last, expects no doses. Args: as of `Interlock`."""
 
     def __init__(self, n: int, config: SafetyConfig, *args: Any) -> None:
         super().__init__(n, WatchedSafety(**{f.name: getattr(config, f.name) for f in fields(config)}), *args)

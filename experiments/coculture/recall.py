@@ -18,7 +18,7 @@ Shown = tuple[float, str, tuple[Any, ...]]
 
 @dataclass
 class Chapter:
-    """An estimator as it was at a minute, and what it was shown from then on: (minute, method, arguments)."""
+    """Copy of the estimator at a minute, and the calls it has had since: (minute, method, arguments)."""
 
     minute: float
     then: CompositionEstimator
@@ -27,7 +27,7 @@ class Chapter:
 
 @dataclass
 class Again:
-    """An estimator that takes the past again: it stands before entry `entry` of chapter `chapter`."""
+    """Estimator copy that replays past data; the next item is entry `entry` of chapter `chapter`."""
 
     chapter: int
     estimator: CompositionEstimator

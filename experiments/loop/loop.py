@@ -136,7 +136,7 @@ class ClosedLoop:
                 signal.known(plant, flow_ml_s, self.interlock.bench)
 
     def run(self) -> Iterator[Step]:
-        """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
+        """Yield each step until every reactor's schedule is over or the reactor was given up. Raises: ReactorError."""
         while not self.over:
             yield self.step()
 

@@ -56,7 +56,7 @@ class Record:
     """Journal, recordings, state and events of one run.
 
     Args:
-      folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
+      folder: run folder; an existing run in it is continued. names: of the reactors.
       fsync: each row on the disk before the call returns, and its curves visible. columns: of the recordings.
     Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
       mended on opening.

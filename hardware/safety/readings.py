@@ -89,11 +89,7 @@ class Readings:
         return [Finding(fault, mask, {"age_s": age}) for fault, mask in rows.items()]
 
     def resumed(self) -> None:
-        """Restart the age of the newest sample.
-
-        While the program was gone nobody could have seen a sample: a reactor is stale, lost or silent only once it
-        had its chance.
-        """
+        """Restart the age of the newest sample at zero: no sample could be taken while the program was stopped."""
         self._fresh_s = np.full_like(self._fresh_s, math.nan)
 
 
