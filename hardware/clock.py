@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 STEP_S = 30.0
-"""Real seconds by which the clock of the day may differ from what is known of the time before that is told."""
+"""Difference of the wall clock from the known time above which a warning is given, real s."""
 
 
 class Clock(Protocol):
@@ -84,7 +84,7 @@ def boot() -> str:
 
 
 def uptime() -> float:
-    """Return real seconds on a clock that nobody sets, and that goes on while the computer sleeps where it can."""
+    """Return real seconds on the monotonic clock; it counts the computer's sleep where the system allows."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 

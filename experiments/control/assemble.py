@@ -49,7 +49,7 @@ USUAL_VIALS = "nominal_noise"  # preset
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What a deploy config comes to, part by part; nobody below holds the config itself.
+    """Objects built from a deploy config, part by part; lower layers do not hold the config itself.
 
     family, backend, bench: of the reactors. scenarios, ends, roles: one per reactor.
     plant: of the simulated vials, that of a `plant_file` where there is one; with an `env_file` it grows and is fed as

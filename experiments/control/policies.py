@@ -62,7 +62,7 @@ class WantedPolicy:
 
 @dataclass(frozen=True)
 class Training:
-    """What a policy file says of its training; nan where it does not say it.
+    """Training data of a policy file; nan where missing.
 
     control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
     setpoints: lowest and highest one, OD. relative: it serves any control period and setpoint.
@@ -172,7 +172,7 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
 
 
 def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:
-    """Judge a policy by its certificate where a culture is at stake; what its training lacks is told, not refused."""
+    """Judge a policy by its certificate where a culture is at stake; a weak training gives a warning only."""
     training = Training.of(policy).doubts(wanted.setpoints)
     if not wanted.at_stake:
         return Opinion(short=training)

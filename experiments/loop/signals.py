@@ -122,7 +122,7 @@ Count = tuple[int, float, float, float]
 """What was counted in a sample: number of the reactor, value, its sd, minute of the run at which it was drawn."""
 Span = tuple[float, float]
 Answer = tuple[str, bool]
-"""What came of a sample, in words, and whether that is worth a warning."""
+"""The outcome of a sample as text, and whether that is a warning."""
 
 
 @runtime_checkable
@@ -143,15 +143,15 @@ class Draws(Protocol):
 
 @runtime_checkable
 class Counted(Protocol):
-    """A signal that learns from samples which somebody counted."""
+    """A signal that learns from counted samples."""
 
     def counted(self, n: int, value: float, sd: float, minute: float) -> Answer:
         """Take what was counted of reactor n at a minute of the run, with its sd; return what came of it."""
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """Replay what earlier lives of the run recorded: columns of each reactor, and every sample.
+        """Replay what was recorded before a resume: columns of each reactor, and every sample.
 
-        Args: light: lowest and highest believed counts of fluorescence.
+        Args: light: lowest and highest valid counts of fluorescence.
         """
 
 

@@ -31,9 +31,9 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 class ChangeLog:
-    """Logs what changes, once: phases, who decides, words of the interlock; and notes of the reactors, once an hour.
+    """Log changes once: phases, who decides, alarms of the interlock; and notes of the reactors, once an hour.
 
-    Args: loop: that is watched. tell: is told of alarms and hand-overs, too: event, text, reactor.
+    Args: loop: that is watched. tell: called for alarms and hand-overs, too: event, text, reactor.
     """
 
     def __init__(self, loop: ClosedLoop, tell: Callable[[str, str, str], None] | None = None) -> None:
@@ -112,7 +112,7 @@ class ChangeLog:
 
 
 def reasons_line(rows: Rows) -> str:
-    """List what the interlock said in a run, most frequent first; "" if it had nothing to say."""
+    """List the interlock's alarms in a run, most frequent first; "" if there were none."""
     often = sorted(rows.reasons.items(), key=lambda item: -item[1].rows)
     return "; ".join(f"{kind} in {t.rows} of {len(rows)} rows, {span(t.first_min, t.last_min)}" for kind, t in often)
 

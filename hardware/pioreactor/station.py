@@ -113,7 +113,7 @@ class PioreactorStation(Station):
         self.book.log("command", job=job, options=options)
 
     def go_on(self) -> None:
-        """Take in what the unit said, and go on with a dose and what else is under way."""
+        """Take the unit's reports; continue the dose and other tasks under way."""
         course = self._course
         if course is not None and next(course, None) is None and self._course is course:
             self._course = None
@@ -249,7 +249,7 @@ class PioreactorStation(Station):
         self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Send the thermostat its target until it says it; one that hears nothing any more is started anew."""
+        """Send the thermostat its target until it reports it; restart one that no longer responds."""
         if not self._target_sent_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
