@@ -185,7 +185,7 @@ class DQNAgent:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the complete learning state. A new agent of the same config continues to the bit on one processor."""
+        """Return the complete learning state. A new agent of the same config continues bit for bit on one processor."""
         tensors = {"online": self.network.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
         counts = {"steps": self.steps, "updates": self.updates}
         parts = {name: part.state_dict() for name, part in self._parts.items()}

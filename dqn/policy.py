@@ -59,7 +59,7 @@ class Policy:
 
     @property
     def observation(self) -> tuple[str, ...]:
-        """Names of the inputs, of those that are known."""
+        """Names of the network's inputs, in order."""
         return tuple(self.metadata["observation"])
 
     def q_values(self, observation: NDArray[Any]) -> NDArray[np.float32]:

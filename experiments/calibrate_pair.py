@@ -112,7 +112,7 @@ def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfi
     lit = [(p, p.light.value) for p in points if p.light is not None]
     if not lit:
         where = ", ".join(config.second)
-        raise frame.UserError(f"second={where}: no light in it; record with backend.fluorescence, which measures it")
+        raise frame.UserError(f"second={where}: the recording has no fluorescence; record with backend.fluorescence")
     if dark := [p for p, light in lit if light <= 0.0]:
         at = f"second: light at {dark[0].temperature:.1f} degC is no more than offset={config.offset:g} counts"
         raise frame.UserError(

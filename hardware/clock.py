@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 STEP_S = 30.0
-"""Real seconds by which the clock of the day may differ from what is known of the time before that is told."""
+"""Difference of the wall clock from the known time above which a warning is given, real s."""
 
 
 class Clock(Protocol):
@@ -84,12 +84,12 @@ def boot() -> str:
 
 
 def uptime() -> float:
-    """Return real seconds on a clock that nobody sets, and that goes on while the computer sleeps where it can."""
+    """Return real seconds on the monotonic clock; it counts the computer's sleep where the system allows."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class RunTime(NamedTuple):
-    """Run time, s, at least low_s and at most high_s; step_s: real seconds by which the clock of the day is off it."""
+    """Run time, s, at least low_s and at most high_s; step_s: real seconds by which the wall clock is off."""
 
     s: float
     low_s: float
@@ -100,11 +100,11 @@ class RunTime(NamedTuple):
 def run_time(
     rows: Sequence[Mapping[str, Any]], speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf
 ) -> RunTime:
-    """Return the time of a run by all that is known: the one place where the clock of the day is believed or not.
+    """Return the current time of a run: that of the newest journal row plus the time since.
 
-    Time is counted on from the newest row that says its run time. In the boot in which that was written, the clock that
-    nobody sets tells how long ago it was; after another one only the clock of the day does, which may have been set.
-    Neither is believed outside the bounds, and the run never goes back.
+    If the computer was not rebooted since that row, its monotonic clock gives the time since; otherwise only its wall
+    clock does, which may have been set. A clock with a result outside the bounds is not used; the result is limited to
+    the bounds and never before that row.
 
     Args: rows: of its journal. speed: device seconds per real second; 0: virtual time, which stands still while no
       program runs. low_s, high_s: bounds on the run time by the devices.

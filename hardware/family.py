@@ -73,11 +73,11 @@ class Can:
 
 @dataclass(frozen=True)
 class Opening:
-    """What a family is given to open its reactors.
+    """Everything that a family needs to open its reactors.
 
-    backend: its config. bench: volume, period and pump. plant: of simulated vials. journal: of the run, into which a
-    driver writes every command before it is carried out; `journal.rows` is what an earlier life of the run wrote.
-    folder: of the run. resumed: there was such a life.
+    backend: its config. bench: volume, period and pump. plant: of simulated vials. journal: of the run; a driver writes
+    every command into it before sending the command; `journal.rows` holds the rows written before an interruption.
+    folder: of the run. resumed: whether this run continues an earlier one.
     """
 
     backend: Any
@@ -88,7 +88,7 @@ class Opening:
     resumed: bool
 
     def earlier(self) -> list[dict[str, Any]]:
-        """Return the rows of the run's earlier lives, none in a new run. Raises: RecordingError where they are gone."""
+        """Return the rows written before a resume, none in a new run. Raises: RecordingError if they are missing."""
         if self.resumed and not self.journal.rows:
             raise JournalMissing(path=self.journal.path)
         return self.journal.rows
@@ -98,7 +98,7 @@ class Opening:
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
     def elapsed_s(self, speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf) -> float:
-        """Return the run time that has passed, s; 0 in a new run. Args: as of `run_time`, which is told if in doubt."""
+        """Return the run time that has passed, s; 0 in a new run; warn of a doubtful clock. Args: as of `run_time`."""
         found = run_time(self.journal.rows, speed, low_s, high_s)
         if found.step_s:
             log.warning(messages.ClockMoved(by_min=found.step_s / 60.0, minute=found.s / 60.0))
@@ -252,7 +252,7 @@ def _looked_at(reactors: Reactor) -> Iterator[Check]:
 
 @contextmanager
 def not_looked_at(resumed: bool) -> Iterator[None]:
-    """Who stops it here, or resumes in vain, is told that nobody looked at the pumps: one may have been left on."""
+    """Warn, on Ctrl-C or a failed resume, that the pumps were not checked and may still be on."""
     try:
         yield
     except (KeyboardInterrupt, LinkError) as error:

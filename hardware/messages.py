@@ -1,4 +1,4 @@
-"""What every kind of reactor may tell of itself or its link: faults, and notes on doses."""
+"""Messages of every kind of reactor or its link: faults, and notes on doses."""
 
 import re
 from typing import ClassVar
@@ -8,7 +8,7 @@ from hardware.errors import DeviceStateError
 
 
 class Fault(Message):
-    """Something wrong with one reactor: which kind, what was seen, what helps.
+    """Something wrong with one reactor: kind, observation, remedy.
 
     Attributes: response, what the interlock does about it, a word of `hardware.safety.config.WORDS`; kind, by which
       settings and records name it: the class that declares the response, with underscores and without "Fault".
@@ -51,19 +51,20 @@ class NoNewSample(Message, says="no new sample"):
     """The sample was answered already, or none came yet."""
 class DoseUnderWay(Message, says="the previous dose has not ended"):
     """Its pumps are not yet verified off; if that stays, see the fault of kind pump."""
-class OpenDose(Message, says="an earlier life of the program left a dose of {ml:.2f} mL open",
+class OpenDose(Message, says="a dose of {ml:.2f} mL was open when the program ended",
     remedy="look at the level and at the bottle"):
-    """The program died in a dose; the next note says what it gave, if not what was planned."""
+    """The program was killed in a dose; the next note has its volume, if not as planned."""
 class NotLeftOff(DeviceStateError, says="{why}; {failed}"): ...
 class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
     remedy="pull the plug of the pump boards now"): ...
 class PreflightFailed(DeviceStateError, says="preflight: {count} of {of} checks failed, the first: {first}"): ...
-class PumpsNotLookedAt(Message, says="stopped before the pumps were looked at: pumps not verified off",
+class PumpsNotLookedAt(Message, says="stopped before the pumps were checked: pumps not verified off",
     remedy="look at the pumps, resume the run"):
-    """An earlier life of the run may have left a pump on."""
+    """A pump may be on since the run was interrupted."""
 class ClockMoved(Message, says="this computer's clock moved by {by_min:.1f} min since the run's last row: "
     "the run goes on at minute {minute:.1f}, without that step", remedy="set its clock right, look at its battery"):
-    """The clock was set while no program ran; the run counts by the device's cycles and a clock that nobody sets."""
-class ClockDoubtful(Message, says="how long no program ran is known by this computer's clock alone, which may be wrong",
+    """The clock was set while no program ran; the run uses the device's cycles and the monotonic clock."""
+class ClockDoubtful(Message,
+    says="the length of the interruption is known only from this computer's clock, which may be wrong",
     remedy="compare the minute in the next line with a watch"):
-    """Computer and device were both started anew."""
+    """Both the computer and the device were rebooted."""

@@ -24,10 +24,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Vitals:
-    """What a device tells of itself beside the sample.
+    """State of a device beside the sample.
 
     age_s: time since the newest sample arrived, by this computer's monotonic clock, shape (N,).
-    raw: spectrometer counts of the newest sample, shape (N,); nan is a reading that is not to be believed.
+    raw: spectrometer counts of the newest sample, shape (N,); nan is an invalid reading.
     faults: what is wrong with each reactor, or None; N entries.
     blank: counts that read as OD 0 when that sample was taken, shape (N,); None where the device has none.
     """

@@ -111,19 +111,19 @@ class Stations(Generic[S, H]):
         return self._clock.now() - self._zero
 
     def begin(self, histories: Mapping[str, H] | None = None, elapsed_s: float = 0.0) -> None:
-        """Every reactor into its running state; a begin that fails or is stopped leaves all pumps off, or says so.
+        """Bring every reactor into its running state; if that fails or is stopped, switch all pumps off, or report it.
 
         Args: histories: `replay` of the journal of the run that is resumed. elapsed_s: run time that has passed since
           that run began.
         Raises: ReactorError for a reactor that cannot be brought there; of a run that is resumed only if none can: the
-          others do not wait for one in trouble, which is told and tried again.
+          others do not wait for a failed one, which is reported and tried again.
         """
         self._zero = self._clock.now() - elapsed_s
         with left_off(self):
             self._take_over(histories or {})
 
     def _take_over(self, histories: Mapping[str, H]) -> None:
-        """Every reactor as an earlier life left it, then into its running state. Raises: as `begin`."""
+        """Restore every reactor, then bring it into its running state. Raises: as `begin`."""
         raise NotImplementedError
 
     def measure(self) -> Measurement:
@@ -190,7 +190,7 @@ class Stations(Generic[S, H]):
         return Receipt(volume, notes, waste, kept)
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Return what was given beyond what was booked when doses began, not told before: run time, s, and volumes."""
+        """Return volumes given beyond those booked when doses began, each once: run time, s, and receipt."""
         found = []
         for i, station in enumerate(self.stations):
             mine = np.arange(len(self.stations)) == i

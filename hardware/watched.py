@@ -1,4 +1,4 @@
-"""Reactors that are read and cannot act, and the interlock over them, which only tells."""
+"""Reactors that are only read, and their interlock, which only reports."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -23,7 +23,7 @@ class WatchedSafety(SafetyConfig):
 
 
 class WatchedInterlock(Interlock):
-    """Tells of what lasts, and expects none of the doses that it allows. Arguments as of `Interlock`."""
+    """Interlock of a device that is only read: reports faults that last, expects no doses. Args: as of `Interlock`."""
 
     def __init__(self, n: int, config: SafetyConfig, *args: Any) -> None:
         super().__init__(n, WatchedSafety(**{f.name: getattr(config, f.name) for f in fields(config)}), *args)
@@ -43,7 +43,7 @@ class WatchedInterlock(Interlock):
 
 
 class Watched(Reactor):
-    """N reactors that somebody else regulates. What goes in is evidence, told by `repeated`."""
+    """N reactors that another program regulates. Doses that were seen are returned by `repeated`."""
 
     names: tuple[str, ...] = ()
 
@@ -51,7 +51,7 @@ class Watched(Reactor):
         self.names, self._seen = tuple(names), list[tuple[float, Receipt]]()
 
     def seen(self, at_s: float, volume_ml: Array) -> None:
-        """Tell of doses that were seen, mL, (N,), at a run time, s."""
+        """Book doses that were seen, mL, (N,), at a run time, s."""
         if (volume_ml != 0.0).any():
             self._seen.append((at_s, Receipt(volume_ml)))
 

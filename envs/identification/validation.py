@@ -21,10 +21,10 @@ SLOPE_MIN = 20.0
 
 @dataclass(frozen=True)
 class Ahead:
-    """How far n readings of the second half lie from what was expected so many minutes before, rms in % of the OD.
+    """RMS error, % of OD, of predictions `minutes` ahead of n readings of the second half.
 
-    model_pct: by the pair of the first half and the pump. od_stays_pct: by the OD then. same_slope_pct: by the growth
-    of ln OD over the 20 min before.
+    model_pct: by the model fitted to the first half. od_stays_pct: by a constant OD. same_slope_pct: by the growth of
+    ln OD over the 20 min before.
     """
 
     minutes: float

@@ -139,7 +139,7 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
 
 
 def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
-    """List the requirements that a policy fails at single setpoints, without an attack on its bands."""
+    """List the requirements that a policy fails at single setpoints; skip the search for trajectories out of a band."""
     asked = question(policy, config, setpoints)
     if policy.observation != RELATIVE:
         lines = np.clip(np.asarray(setpoints, dtype=np.float64), *asked.setpoints)

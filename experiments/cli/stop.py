@@ -159,7 +159,7 @@ def unmasked() -> Iterator[None]:
 class Pause:
     """Signals that wait until the work can be saved, and then go to their previous handler.
 
-    Args: until: when it will look, for the user.
+    Args: until: text shown to the user: when the work will stop.
     """
 
     def __init__(self, until: str) -> None:
@@ -202,7 +202,7 @@ class Pause:
 def pausing(until: str) -> Iterator[Pause]:
     """Let the first signal only set the yielded pause; a second one from the user ends the program at once.
 
-    For work that can be saved between two of its steps only. Args: until: when it will look, for the user.
+    Use it only for work that can be saved between two steps. Args: as of `Pause`.
     """
     pause = Pause(until)
     with handled(pause.answer, *SIGNALS, *CLUSTER):

@@ -76,8 +76,8 @@ def read(folder: Path) -> Sweep | None:
 def asked(given: Sequence[str], command: str) -> Sweep | None:
     """Return the sweep of a command line, None for a single run.
 
-    `resume=SWEEP` is the sweep of that folder, with the launcher of this line.
-    Raises: UserError with other arguments beside it.
+    `resume=SWEEP` continues the sweep in that folder; it may change the launcher.
+    Raises: UserError if other arguments are given, too.
     """
     plain = [a for a in given if a not in FLAGS]
     folder = next((Path(a.removeprefix("resume=")) for a in reversed(plain) if a.startswith("resume=")), None)
@@ -86,7 +86,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
         others = [a for a in plain if not a.startswith(("resume=", *LATER))]
         if others or before.command != command:
             what = others[0] if others else f"experiments.{command}"
-            raise UserError(f"{what}: a resumed sweep is {before.again()}, with all its values; drop it")
+            raise UserError(f"{what}: a resumed sweep keeps its values; use {before.again()}")
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
         kept = [a for a in before.arguments if a.partition("=")[0] not in keys]

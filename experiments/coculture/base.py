@@ -17,7 +17,7 @@ SEEN_AHEAD = (*SEEN, "logit_next", "minutes_to_change")
 
 @dataclass(frozen=True, eq=False)
 class ShareEstimate:
-    """What is believed of N cultures.
+    """Estimate of N cultures.
 
     logit: of the share r of the second species. sd: of that logit. temperature: of the vial, degC. rate: lagged growth
     rate m_p of the second species, 1/h. error_e, error_p: relative, of the growth curves. thermometer: true less

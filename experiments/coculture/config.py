@@ -29,7 +29,7 @@ USUAL = "ecoli_pputida"
 
 
 class OfDeploy:
-    """What `deploy` can be told of two species."""
+    """Two-species options of `deploy`."""
 
     composition: Any = setting(
         None,
@@ -48,13 +48,13 @@ class OfDeploy:
 
 
 class OfEmulator:
-    """What the device in software can be told of two species."""
+    """Two-species options of the emulator."""
 
     pair: str = setting(USUAL, "two species: a preset of conf/strains, or a pair.yaml")
 
 
 class OfTrain:
-    """What `train` can be told of two species."""
+    """Two-species options of `train`."""
 
     pair: str | None = setting(
         None,
@@ -68,7 +68,7 @@ class OfTrain:
 
 
 class OfStudy:
-    """What a study of `benchmark` can be told of two species."""
+    """Two-species options of a study of `benchmark`."""
 
     compositions: tuple[str, ...] = setting(
         (), "names of composition controllers; `controllers` then control the density beside each of them"
@@ -78,7 +78,7 @@ class OfStudy:
 
 
 class OfBenchmark:
-    """What `benchmark` can be told of two species."""
+    """Two-species options of `benchmark`."""
 
     pair: str = setting(
         USUAL, "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"

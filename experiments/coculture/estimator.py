@@ -29,7 +29,7 @@ LONGEST_STEP_MIN = 1.0
 
 @dataclass(frozen=True)
 class CompositionEstimatorConfig:
-    """What the filter believes before it has seen anything.
+    """Settings of the filter before its first reading.
 
     Seventeen real reactors had factors of 0.75 to 1.19 and offsets of 151 to 339 counts (Lee et al., Cell Reports
     Methods 5:101009, 2025, public model); their mean and spread are the defaults, which a calibration replaces
@@ -156,13 +156,13 @@ class CompositionEstimator:
         return self._given_ml
 
     def gave(self, volume_ml: Array, rows: Mask) -> None:
-        """Set the volume delivered since the newest readings of `rows`, mL, (N,), in place of what was told before."""
+        """Set the volume delivered since the newest readings of `rows`, mL, (N,), in place of the earlier value."""
         self._given_ml = np.where(rows, volume_ml, self._given_ml)
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Take the readings of `rows` that were not taken yet, each (N,).
 
-        Args: od; fluorescence: counts; temperature: degC; nan: none, or none that is believed, which is skipped.
+        Args: od; fluorescence: counts; temperature: degC; nan: none, or an invalid one, which is skipped.
           minute: when they were taken, on any clock that only rises.
         """
         new = rows & ~(minute <= self._minute)
@@ -346,7 +346,7 @@ class CompositionEstimator:
         self._doses[idx] += given * (np.stack([precision, sum_of], axis=-1) - self._doses[idx] / DOSES)
 
     def _density_anew(self, idx: Rows, start: Rows, od: Array) -> None:
-        """Accept a density that jumped and stays; the pigment may have gone with it, as by a dose nobody told."""
+        """Accept a density that jumped and stays; the pigment may have changed with it, as by an unrecorded dose."""
         found = np.log(np.maximum(od, LOWEST_OD))
         jump = found - self.mean[idx, start, LOG_OD]
         self.mean[idx, start, LOG_OD], self.mean[idx, start, LOG_F] = found, self.mean[idx, start, LOG_F] + jump
@@ -355,7 +355,7 @@ class CompositionEstimator:
         self.cov[idx, start, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
 
     def _pigment_anew(self, idx: Rows, start: Rows, light: Array) -> None:
-        """Light that jumped and stays is believed to be the pigment's."""
+        """Attribute light that jumped and stays to the pigment."""
         z, cov = self.mean[idx, start], self.cov[idx, start]
         k, scattered = z[:, FACTOR], self.config.od_term * np.exp(z[:, LOG_OD])
         f = np.maximum((light - z[:, OFFSET]) / k - scattered, LOWEST_LIGHT)
@@ -392,7 +392,7 @@ class CompositionEstimator:
         return np.asarray((self._weights() * of_starts).sum(axis=1))
 
     def estimate(self) -> ShareEstimate:
-        """Share, temperature and rates as they are believed; before the first reading the first guess."""
+        """Return estimated share, temperature and rates; before the first reading the first guess."""
         z, mixed = self.mean, self._mixed
         logit, error = mixed(z[..., LOGIT]), mixed(z[..., THERMOMETER])
         variance = mixed(self.cov[..., LOGIT, LOGIT] + np.square(z[..., LOGIT] - logit[:, None]))

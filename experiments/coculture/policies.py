@@ -49,9 +49,9 @@ def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Pol
 
 
 def check_shares(policy: Policy, kind: str, programs: list[Program], forced: bool) -> None:
-    """Whether a policy was trained for what is asked for; a share beyond that it holds at the end of its range.
+    """Check that a policy was trained for the requested shares; it holds one beyond its range at the range's end.
 
-    Raises: UserError; forced: it is only said.
+    Raises: UserError; forced: only a warning.
     """
     low, high = policy.metadata["model"]["setpoints"]
     outside = sorted({s for p in programs for s in p.extremes if not low - 1e-9 <= s <= high + 1e-9})

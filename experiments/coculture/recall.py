@@ -1,4 +1,4 @@
-"""An estimator that can be told of the past: it goes back, and takes again what it has been shown since."""
+"""An estimator that takes late samples: it goes back in time and replays all data since."""
 
 import copy
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ Shown = tuple[float, str, tuple[Any, ...]]
 
 @dataclass
 class Chapter:
-    """An estimator as it was at a minute, and what it was shown from then on: (minute, method, arguments)."""
+    """Copy of the estimator at a minute, and the calls it has had since: (minute, method, arguments)."""
 
     minute: float
     then: CompositionEstimator
@@ -27,7 +27,7 @@ class Chapter:
 
 @dataclass
 class Again:
-    """An estimator that takes the past again: it stands before entry `entry` of chapter `chapter`."""
+    """Estimator copy that replays past data; the next item is entry `entry` of chapter `chapter`."""
 
     chapter: int
     estimator: CompositionEstimator
@@ -40,7 +40,7 @@ class Recall:
     A share that was counted belongs to the minute at which the sample was drawn, which may be a day ago. Then a copy of
     the estimator goes back to the full hour before that, and takes again all readings, doses and samples in their
     order, as many with each new reading as the loop can wait for; once it has caught up it stands in for the estimator.
-    The result is that of a filter that was told at once. A resumed run is told its last two days anew (`retell`).
+    The result equals a filter that had the sample at once. A resumed run replays its last two days (`retell`).
     """
 
     remembers = ("estimator", "earliest")
@@ -117,9 +117,9 @@ class Recall:
         return True
 
     def retell(self, shown: Iterable[Shown]) -> None:
-        """Replay what a resumed run was shown in its earlier lives, in order, after what is `known`.
+        """Replay what a resumed run was shown before the resume, in order, after what is `known`.
 
-        Until it has caught up the estimate is that which was saved.
+        Until the replay is complete, the estimate is the saved one.
         """
         self._forget()
         last = self.known

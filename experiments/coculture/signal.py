@@ -52,7 +52,7 @@ class ShareWarnings:
 
 
 class LightSignal:
-    """The fluorescence of reactors whose share nobody holds: recorded, and nothing done about it."""
+    """Fluorescence of reactors without a composition controller: recorded only."""
 
     name, actuator, columns, memory = "fluorescence", "", COLUMNS[:1], None
     sees_light = False  # what is measured anyhow
@@ -71,7 +71,7 @@ class LightSignal:
 
 @dataclass(frozen=True, eq=False)
 class Decider:
-    """What is believed of the share, and what is done about it."""
+    """Estimator and controller of the composition."""
 
     remembers = ("estimator", "law")
     estimator: Recall
@@ -229,7 +229,7 @@ class Share:
         return self
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
-        """See `Signal.dosed`; what was put off comes later."""
+        """See `Signal.dosed`; deferred volumes (`kept_ml`) are counted when they are delivered."""
         self.estimator.dosed(volume_ml)
 
     def draw(self, table: Any, title: str) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
 
 
 def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """List the rows of every trial, of a density one per window."""
+    """List the rows of all trials; a density trial has one row per window."""
     return [found for trial in trials for found in ROWS[trial.cell.signal](trial)]
 
 

@@ -49,7 +49,7 @@ USUAL_VIALS = "nominal_noise"  # preset
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What a deploy config comes to, part by part; nobody below holds the config itself.
+    """Objects built from a deploy config, part by part; lower layers do not hold the config itself.
 
     family, backend, bench: of the reactors. scenarios, ends, roles: one per reactor.
     plant: of the simulated vials, that of a `plant_file` where there is one; with an `env_file` it grows and is fed as
@@ -59,7 +59,7 @@ class Setup:
     policy: as read, None for a preflight. bounds: of its certificate.
     further: signals that are held beside the density, which have seen nothing yet.
     fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
-    resumed: an earlier life of the run is continued.
+    resumed: whether this run continues an earlier one.
     """
 
     family: Family
@@ -172,7 +172,7 @@ def _check_room(bench: Bench, safety: SafetyConfig, above_ml: Array) -> None:
     room_ml = float(np.min(np.minimum(safety.overflow_ml, above_ml)))
     largest_ml, allowed_ml = bench.max_rate * bench.period_s, min(room_ml, safety.ml_a_minute(bench))
     if largest_ml > allowed_ml + 1e-9:
-        given = f"bench.max_rate = {bench.max_rate:g} over {bench.period_s:g} s comes to {largest_ml:.3g} mL at once"
+        given = f"bench.max_rate = {bench.max_rate:g} over {bench.period_s:g} s makes one dose of {largest_ml:.3g} mL"
         allowed = f"{max(allowed_ml, 0.0):.3g} mL (what a vial has room for above its tube, and safety.ml_per_minute)"
         least = max(np.floor(1e5 * allowed_ml / bench.period_s) / 1e5, 0.0)
         raise frame.UserError(f"{given}: allowed {allowed}; give bench.max_rate={least:g} or less")

@@ -1,4 +1,4 @@
-"""What `deploy` tells: at the start of a run, of marks, of its hook, and at its end."""
+"""Messages of `deploy`: at the start of a run, of marks, of its hook, and at its end."""
 
 from conf.messages import Message
 from experiments.cli.words import UserError
@@ -12,7 +12,7 @@ class HookFailed(Message, says="notify: {hook} did not take a message ({why}); t
     """Not reached, refused or failed; tried once for 10 s, said once, counted."""
 class HookTally(Message,
     says="notify: {hook} took {sent} messages; {failed} failed, {dropped} dropped, {left} left at the end"): ...
-class HookUnusable(Message, says="{why}", remedy="then resume again; until then nobody is told"):
+class HookUnusable(Message, says="{why}", remedy="then resume again; until then nothing is sent"):
     """A resumed run cannot use what notify names; it goes on."""
 class NoHost(UserError, says="notify: the address has no host", remedy="allowed https://HOST/..."): ...
 class NoCommand(UserError, says="notify: {why}", remedy="allowed a command, https://... or env:NAME"): ...

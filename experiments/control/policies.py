@@ -56,13 +56,13 @@ class WantedPolicy:
 
     @property
     def refuses(self) -> bool:
-        """Whether a policy that is not proven to be safe may not run."""
+        """Whether a policy without a safety proof is refused."""
         return self.at_stake and not self.forced
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a policy file says of its training; nan where it does not say it.
+    """Training data of a policy file; nan where missing.
 
     control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
     setpoints: lowest and highest one, OD. relative: it serves any control period and setpoint.
@@ -85,7 +85,7 @@ class Training:
         return cls(control, regret, updates, limits, policy.observation == policies.RELATIVE)
 
     def doubts(self, setpoints: Sequence[float]) -> list[str]:
-        """Return what speaks against the training, each with its remedy; what the file does not say is none."""
+        """List reasons against this training, each with its remedy; a value missing from the file gives no reason."""
         low, high = self.setpoints
         outside = sorted({s for s in setpoints if s < low - 1e-9 or s > high + 1e-9})
         reasons = {
@@ -162,7 +162,7 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
     """Refuse a policy that is not proven to be safe for this run, and warn of all else that speaks against it.
 
     Args: file: of the policy, beside which its certificate lies.
-    Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
+    Raises: UserError where a culture is at stake, unless it is forced or the resumed run began with it.
     """
     found = _judged(policy, file, wanted)
     if found.refused and not resumed and wanted.refuses:
@@ -172,7 +172,7 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
 
 
 def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:
-    """Judge a policy by its certificate where a culture is at stake; what its training lacks is told, not refused."""
+    """Judge a policy by its certificate where a culture is at stake; a weak training gives a warning only."""
     training = Training.of(policy).doubts(wanted.setpoints)
     if not wanted.at_stake:
         return Opinion(short=training)

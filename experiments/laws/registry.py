@@ -79,27 +79,27 @@ SIGNALS = {
     )
 }
 KINDS = SIGNALS[DENSITY].kinds
-"""The laws of the density."""
+"""The controllers of the density."""
 
 
 def hold(signal: str, key: str, parts: Mapping[str, Part]) -> None:
-    """Make a signal known whose laws are said at a key of their own, with presets of that group. Args: of `Laws`."""
+    """Register a signal whose controllers have their own config key and presets. Args: as of `Laws`."""
     SIGNALS[signal] = Laws(key, parts)
 
 
 def add(
     kind: str, config: type[Any], make: Callable[..., Any], what: str, parts: Sequence[str] = (), signal: str = DENSITY
 ) -> None:
-    """Make a law known: `controller=KIND` of the density, `signals.NAME.kind=KIND` of another signal.
+    """Register a controller: `controller=KIND` for density, `signals.NAME.kind=KIND` for another signal.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      make: called with the config and then the `parts`, returns the law.
-      what: the sentence that the help shows; "": it has a preset of conf/, whose words are shown.
-      parts: what else it is made from, of those that the signal has.
-      signal: which it holds: density, or one of one's own (`experiments.loop.signals.add`).
-    Raises: ValueError for a kind that exists, or a part that nobody has.
+      make: called with the config and then the `parts`, returns the controller.
+      what: the help text; "": that of the preset in conf/.
+      parts: other objects that `make` needs, from those of the signal.
+      signal: what the controller holds: density, or a signal of `experiments.loop.signals.add`.
+    Raises: ValueError for a kind that exists, or a part that the signal lacks.
     """
     held = SIGNALS.setdefault(signal, Laws())
     if wrong := set(parts) - set(held.parts):

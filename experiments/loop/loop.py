@@ -136,7 +136,7 @@ class ClosedLoop:
                 signal.known(plant, flow_ml_s, self.interlock.bench)
 
     def run(self) -> Iterator[Step]:
-        """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
+        """Yield each step until every reactor's schedule is over or the reactor was given up. Raises: ReactorError."""
         while not self.over:
             yield self.step()
 
@@ -278,7 +278,7 @@ class ClosedLoop:
         return "left out: nothing here estimates it", True
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count]) -> None:
-        """Replay recordings of the run's earlier lives, and what was counted, to every estimator that uses them."""
+        """Replay recordings from before a resume, and counted samples, to every estimator that uses them."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))

@@ -98,7 +98,7 @@ class Progress:
         return over, believed & self._grown & ~over
 
     def watch(self, elapsed: Array, od: Array, believed: Mask) -> Mask:
-        """Take a sample; True where it ends a step, (N,). Args: believed: rows whose OD is new and believed."""
+        """Take a sample; return True where it ends a step, (N,). Args: believed: rows whose OD is new and valid."""
         if not self.conditional:
             return np.zeros(elapsed.size, dtype=np.bool_)
         phase, setpoint, _ = self.asked(elapsed)

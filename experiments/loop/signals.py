@@ -62,7 +62,7 @@ class Sample:
         cls, m: Measurement, interlock: Interlock, rows: Mask, believed: Mask, elapsed: Array, phase: NDArray[np.intp],
         setpoint: Array, temperature: Array, ahead: tuple[Array, Array] | None = None,
     ) -> "Sample":  # fmt: skip
-        """Build a sample: a measurement with what the interlock says of its light and of targets."""
+        """Build a sample: measurement, its valid fluorescence (else nan) and the interlock's temperature limits."""
         light, safety = interlock.fluorescence(m), interlock.config
         light = np.full(m.od.shape, np.nan) if light is None else light
         limits = safety.targets
@@ -72,10 +72,10 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a signal tells of a sample.
+    """What a signal reports for a sample.
 
     columns: of the recording, (N,) each. why: further reasons for the journal. warnings: a line for each reactor that
-    has one, None for the others; empty: nothing is ever warned of.
+    has one, None for the others; empty: no warnings.
     """
 
     columns: Mapping[str, Array] = field(default_factory=dict)
@@ -122,12 +122,12 @@ Count = tuple[int, float, float, float]
 """What was counted in a sample: number of the reactor, value, its sd, minute of the run at which it was drawn."""
 Span = tuple[float, float]
 Answer = tuple[str, bool]
-"""What came of a sample, in words, and whether that is worth a warning."""
+"""The outcome of a sample as text, and whether that is a warning."""
 
 
 @runtime_checkable
 class Knows(Protocol):
-    """A signal that tells, in a simulation, what it only believes elsewhere."""
+    """A signal that, in a simulation, also records the true value of its estimate."""
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
         """Take the vials themselves. Args: flow_ml_s: of a pump as the driver takes it."""
@@ -135,7 +135,7 @@ class Knows(Protocol):
 
 @runtime_checkable
 class Draws(Protocol):
-    """A signal that has figures of its own."""
+    """A signal with its own figures."""
 
     def draw(self, table: Any, title: str) -> Mapping[str, Any]:
         """Draw them, by name, at the end of a run. Args: table: its recordings (`experiments/record/record.py`)."""
@@ -143,15 +143,15 @@ class Draws(Protocol):
 
 @runtime_checkable
 class Counted(Protocol):
-    """A signal that learns from samples which somebody counted."""
+    """A signal that learns from counted samples."""
 
     def counted(self, n: int, value: float, sd: float, minute: float) -> Answer:
         """Take what was counted of reactor n at a minute of the run, with its sd; return what came of it."""
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """Replay what earlier lives of the run recorded: columns of each reactor, and every sample.
+        """Replay what was recorded before a resume: columns of each reactor, and every sample.
 
-        Args: light: lowest and highest believed counts of fluorescence.
+        Args: light: lowest and highest valid counts of fluorescence.
         """
 
 

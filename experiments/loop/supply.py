@@ -17,13 +17,13 @@ FEED_PUMP = 1
 
 
 class Supply:
-    """What pumps 3 and 4 owe N reactors: by the steps of their schedules, or by what a signal asks.
+    """Volumes due from pumps 3 and 4 of N reactors, by the steps of their schedules or by a signal.
 
-    owed grows by the mL/h of the step or the signal, and by the step's mL once at its first sample; it is given in
-    doses of `DOSE_ML` to `most_ml`, equal parts where it takes several. What a step still owes at its end is left out.
+    The due volume grows by the mL/h of the step or the signal, and by the step's mL at its first sample. It is
+    delivered in doses of `DOSE_ML` to `most_ml`, split equally if larger. The undelivered rest of a step is dropped.
 
     Args: schedules: one per reactor. most_ml: largest dose. asked: pumps that a signal commands.
-    Attributes: any, whether anything is ever owed; owed_ml, mL, (N, 2); remembers, nothing where nothing is.
+    Attributes: any, whether these pumps are used; owed_ml, due volume, (N, 2); remembers, saved attributes.
     """
 
     def __init__(self, schedules: Sequence[Scenario], most_ml: float, asked: Collection[int] = ()) -> None:
@@ -47,7 +47,7 @@ class Supply:
         self._per_min[:, :, PUMPS.index(pump)] = 60.0 * np.nan_to_num(rate)[:, None]
 
     def due(self, elapsed: Array, phase: NDArray[np.intp], rows: Mask) -> tuple[NDArray[np.intp], Array]:
-        """Which pump each reactor is to be fed by, 1, 3 or 4, and the dose of a spare pump, mL, each (N,).
+        """Return the pump that feeds each reactor, 1, 3 or 4, and the dose of a spare pump, mL, each (N,).
 
         Args: elapsed: min since the schedule began; phase: its step; rows: where a dose may be decided, inside it.
         """

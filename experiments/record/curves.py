@@ -25,12 +25,11 @@ WINDOW = {
 class Curves:
     """Curves of N reactors over minutes of the run: one reactor's in the run folder, several in reactors/NAME/.
 
-    Points are dated by their minute, so that the axes "relative" and "wall" show hours of the culture, in a simulation
-    of some seconds too.
+    Points carry run time, so the axes "relative" and "wall" show culture hours, even for a simulation of seconds.
 
     Args:
       folder: run folder. names: of the reactors. columns: that the recordings have.
-      first_minute: where a resumed run goes on, or 0.
+      first_minute: of a resumed run, or 0.
       began: when the run began, s since 1970; None: now.
     """
 

@@ -1,4 +1,4 @@
-"""What a run's record tells: alarms that ended, who decides, what was repaired, files that cannot be used."""
+"""Messages of a run's record: alarms that ended, who decides, what was repaired, files that cannot be used."""
 
 from conf.messages import Message
 from hardware.errors import RecordingError
@@ -7,8 +7,8 @@ from hardware.errors import RecordingError
 
 class WellAgain(Message, says="interlock: all well again"):
     """Doses again."""
-class AlarmsTold(Message, says="{reactor}: the interlock told: {kinds}"):
-    """At the end of a run: how often and when each kind was said."""
+class AlarmsTold(Message, says="{reactor}: interlock alarms of the run: {kinds}"):
+    """At the end of a run: rows and time span of each kind of alarm."""
 class PhaseBegins(Message, says="{reactor}: {what} from minute {minute:.0f}, OD {od:.3f}"): ...
 class StepEnded(Message, says="{reactor}: step {step} ended after {minutes:.0f} min: {why} at OD {od:.3f}"): ...
 class WindowEnds(Message, says="{reactor}: window ends at minute {minute:.0f}, mean error {error:.4f} OD"): ...
@@ -23,7 +23,7 @@ class RecordingGone(Message, says="{path}: deleted or moved in the run",
 class RowCompleted(Message, says="{reactor}: the row of minute {minute} was completed from the journal"):
     """A kill or a power cut while a row was written; nothing else is lost."""
 class TornJournal(Message, says="journal: cut a torn last line of {length} bytes"):
-    """The same."""
+    """A kill or a power cut while a line was written; nothing else is lost."""
 class Resumed(Message, says="resumed at minute {minute:.1f}; {doses} dose(s) booked from the journal"): ...
 class NoState(RecordingError, says="{path}: no state to resume from ({why})",
     remedy="journal and recordings are kept; start a new run, or put back the file as the run wrote it"): ...

@@ -56,7 +56,7 @@ class Record:
     """Journal, recordings, state and events of one run.
 
     Args:
-      folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
+      folder: run folder; an existing run in it is continued. names: of the reactors.
       fsync: each row on the disk before the call returns, and its curves visible. columns: of the recordings.
     Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
       mended on opening.
@@ -134,7 +134,7 @@ class Record:
             raise NotWritten(path=self.folder, why=error.strerror or error) from error
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Replace state.json; it says up to which row of the journal it knows everything."""
+        """Replace state.json; it includes the rows of the journal before its `journal_row`."""
         content = {"journal_row": self.journal.next_row, **state}
         files.write_json(self.state_path, content, self._fsync, indent=None)
 
@@ -146,7 +146,7 @@ class Record:
         return values
 
     def table(self) -> Recordings:
-        """All recordings; a damaged file of marks is said and costs nothing else."""
+        """Return all recordings; if the file of marks is damaged, warn and omit the marks."""
         try:
             marks = sorted(read_marks(self.folder), key=lambda mark: mark.time_min)
         except RecordingError as error:

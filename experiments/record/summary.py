@@ -31,9 +31,9 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 class ChangeLog:
-    """Logs what changes, once: phases, who decides, words of the interlock; and notes of the reactors, once an hour.
+    """Log changes once: phases, who decides, alarms of the interlock; and notes of the reactors, once an hour.
 
-    Args: loop: that is watched. tell: is told of alarms and hand-overs, too: event, text, reactor.
+    Args: loop: that is watched. tell: called for alarms and hand-overs, too: event, text, reactor.
     """
 
     def __init__(self, loop: ClosedLoop, tell: Callable[[str, str, str], None] | None = None) -> None:
@@ -81,7 +81,7 @@ class ChangeLog:
         self.notes(step.now_s, step.notes)
 
     def notes(self, now_s: float, notes: Sequence[str]) -> None:
-        """Log notes. Their numbers may vary, names of reactors and pumps not; what has doubled is told again."""
+        """Log notes; repeat one that differs only in numbers after an hour, or if its largest number has doubled."""
         for note in notes:
             kind, largest = NUMBER.sub("#", note), max(map(float, NUMBER.findall(note)), default=0.0)
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))
@@ -112,7 +112,7 @@ class ChangeLog:
 
 
 def reasons_line(rows: Rows) -> str:
-    """List what the interlock said in a run, most frequent first; "" if it had nothing to say."""
+    """List the interlock's alarms in a run, most frequent first; "" if there were none."""
     often = sorted(rows.reasons.items(), key=lambda item: -item[1].rows)
     return "; ".join(f"{kind} in {t.rows} of {len(rows)} rows, {span(t.first_min, t.last_min)}" for kind, t in often)
 

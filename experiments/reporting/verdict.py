@@ -151,7 +151,7 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
         f"{doses['neither']:.0f} %, the device alone {doses['device']:.0f} %, the controller alone "
         f"{doses['controller']:.0f} %",
         f"not believed {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
-        "the interlock told " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "nothing"),
+        "interlock alarms: " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
     ]
     if "none" in twin:
         return Headline(claim, items, f"No closed loop on a twin: {twin['none']}.")

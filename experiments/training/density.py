@@ -164,7 +164,7 @@ class Preview(DensityTask):
         return np.column_stack([now[differ], now[differ], following[differ], time])
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance OD and program by one decision; x - setpoint."""
+        """Advance OD and program by one decision; return the observation and the error, x - setpoint."""
         state, error = super().advance(observation, action)
         goal = passed(self.config.control_min, observation[..., 1:])
         return np.concatenate([state[..., :1], goal], axis=-1), error

@@ -38,7 +38,7 @@ class Score:
 
     @property
     def steady_abs_error(self) -> Array:
-        """Largest over the setpoints, shape (S,): a lab sees an offset at a single setpoint."""
+        """Largest steady error over the setpoints, shape (S,): a lab sees an offset at a single setpoint."""
         return np.asarray(self.steady_by_setpoint.max(axis=-1))
 
 

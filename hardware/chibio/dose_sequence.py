@@ -40,13 +40,13 @@ class DoseSequence:
     A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
-    Args: agenda: shared by all reactors; what must happen later is put on it. past: gives what this run knows of the
-      reactor by the rows that it wrote, those of earlier lives too.
+    Args: agenda: shared by all reactors; what must happen later is put on it. past: returns the reactor's
+      history by the rows of this run, those before a resume too.
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
-      what doses gave beyond what was booked when they began, until somebody books and clears it; acted, the newest
-      sample a dose was decided for, None where the device's records begin anew; stray_s, clock time at which somebody's
-      dose was last seen or told.
+      volumes given beyond those booked when doses began, until the caller books and clears them; acted, the newest
+      sample a dose was decided for, None where the device's records begin anew; stray_s, clock time at which a
+      foreign dose was last seen or reported.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class DoseSequence:
         self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
 
     def restore(self) -> None:
-        """Continue as an earlier life of the run left it; its pumps are to be verified off next."""
+        """Restore the state before the resume; its pumps are to be verified off next."""
         history = self._past()
         self._quiet_s = history.seen_s
         self.acted = history.sample
@@ -256,7 +256,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """Look at pumps before they go off, after a missing answer or where an earlier life left the dose open."""
+        """Read the pumps before they go off, after a missing answer or if the dose was open before a resume."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:
@@ -270,7 +270,7 @@ class DoseSequence:
         self._doubt_s = seen_s if math.isnan(seen_s) else self._book.elapsed()
 
     def watch(self, state: DeviceState, ours: bool = True) -> None:
-        """Note each feed pump that is on, or has got another target, and not by a dose. Args: ours: nobody else may."""
+        """Note each feed pump that is on or has a new target without a dose. Args: ours: no one else may dose."""
         known, now = self._past(), self._book.elapsed()
         if not ours or state.start_time != known.start_time:
             self._targets.clear()
@@ -289,7 +289,7 @@ class DoseSequence:
             self._quiet_s = now
 
     def _look(self, state: DeviceState, seen_s: float) -> None:
-        """Write down what a look says of an open dose. Args: seen_s: of the last answer, nan if none was missing."""
+        """Record what a read shows of an open dose. Args: seen_s: of the last answer, nan if none was missing."""
         known, now, stopped = self._past(), self._book.elapsed(), None
         if not known.open:
             return

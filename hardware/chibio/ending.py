@@ -86,7 +86,7 @@ def found(
 
     Args: state: as read at run time now_s. seen_s: run time of the last answer before that. silence_s: of this program,
       after which a board agent, if there is one, switches pumps off. stopped: pump, run time at which an agent switched
-      it off; None: it does not say. killed: an earlier life left the dose open, what it sent last is not on record.
+      it off; None: it does not say. killed: the dose was open before a resume, its last command is not on record.
     """
     added: dict[str, Span | None] = {}
     restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)

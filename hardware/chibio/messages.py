@@ -26,12 +26,12 @@ class NotTakenOver(any_kind.StoppedFault, says="not taken over: {error}",
 class BlankChanged(any_kind.BlankFault, says="the blank was changed from {before:.1f} to {now:.1f}",
     remedy="set it back (raw {before:.1f}, OD 0) or start a new run"): ...
 class PumpStaysOn(any_kind.PumpFault, says="{why}", remedy="switch the pump board off by hand"):
-    """A pump was told to stop and not verified off; after four tries the device's experiment is ended."""
+    """A pump was switched off and not verified off; after four tries the device's experiment is ended."""
 class StrayPump(any_kind.PumpFault, says="pumps on: {pumps}, and no dose has them",
     remedy="close the device's web page everywhere; look for a proxy that repeats requests"):
     """Another program switched a pump on, or a command was late or repeated on the way; booked."""
-class ForeignMode(any_kind.ModeFault, says="{mode}: not as this program left it",
-    remedy="set it back in the device's web page, close the page"): ...
+class ForeignMode(any_kind.ModeFault, says="{mode}: not set by this program",
+    remedy="set the mode back in the device's web page, close the page"): ...
 class NoSamples(any_kind.StalledFault, says="no new sample for {age_s:.0f} s, cycles {cycles}",
     remedy="after {lost_s:.0f} s its experiment is restarted; look at the device's terminal"): ...
 class NoNumber(any_kind.StalledFault, says="no new sample for {age_s:.0f} s, cycles {cycles}: {items} holds no number",
@@ -60,13 +60,13 @@ class SlowLink(Message, says="the link is slow: the feed pump's command was answ
 class DoseRepeated(Message,
     says="a dose of {ml:.2f} mL was repeated up to {times} times by the device, {low_ml:.2f} to {most_ml:.2f} mL",
     remedy="booked at their times; look at link and level"): ...
-class DoseGave(Message, says="a dose of {ml:.2f} mL gave {low_ml:.2f} to {most_ml:.2f} mL, booked as the latter"):
-    """Cut short, or not known exactly; alarms go by the least."""
+class DoseGave(Message, says="a dose of {ml:.2f} mL gave {low_ml:.2f} to {most_ml:.2f} mL; {most_ml:.2f} mL booked"):
+    """The dose was cut short or its volume is uncertain; alarms use the smaller volume."""
 class DoseGaveNothing(Message, says="a dose of {ml:.2f} mL gave no medium"): ...
 class DosePerhapsTwice(Message,
-    says="a dose gave {ml:.2f} to {twice_ml:.2f} mL, booked as the former: a lost command may have come late"): ...
+    says="a dose gave {ml:.2f} to {twice_ml:.2f} mL; {ml:.2f} mL booked: a lost command may have come late"): ...
 class GivenWithoutDose(Message,
-    says="{pump} gave {low_ml:.2f} to {most_ml:.2f} mL without a dose, booked as the latter: {cause}",
+    says="{pump} gave {low_ml:.2f} to {most_ml:.2f} mL without a dose; {most_ml:.2f} mL booked: {cause}",
     remedy="close the device's web page everywhere; look at the link"): ...
 class ChangedInDose(Message, says="{pump} in a dose: {cause}",
     remedy="close the device's web page everywhere; look at the link"): ...
@@ -76,9 +76,9 @@ class RanAgain(Message,
 class AgentSwitchedOff(Message, says="the board agent switched off in a dose: {pumps}", remedy="look at the link"): ...
 class AgentSaysNothing(Message, says="the board agent does not say what it switched off: {error}",
     remedy="check the cable; update the board agent"): ...
-class RestartedInDose(Message, says="the device was restarted in a dose, which ended it",
+class RestartedInDose(Message, says="the device restarted during a dose and ended it",
     remedy="look at the power supply"):
-    """A restart switches all pumps off, nobody knows when; the most is booked."""
+    """All pumps are off after a restart. Its time is unknown, so the largest possible volume is booked."""
 class PumpsFoundOn(Message, says="pumps were found on and switched off: {pumps}"): ...
 class MeasuresTooLong(Message, says="the device has measured for {seconds:.0f} s, which is too long: started anew"): ...
 class OldCycle(Message, says="an experiment was stopped, its last cycle may still end: waits {seconds:.0f} s"): ...
@@ -89,7 +89,7 @@ class RestartedAgain(Message, says="the restart before brought no sample, attemp
     remedy="look at the device's terminal: a thermometer or the spectrometer may be dead"): ...
 class NotRestarted(Message, says="the experiment could not be restarted after {kind}, tried again: {error}"): ...
 class PutRight(Message, says="{item} was {found} and was {done}", remedy="close the device's web page everywhere"):
-    """A restart or a web page changed it. A fluorescence slot's cycle has no reading."""
+    """A restart or a web page changed the setting. Of a fluorescence slot, this cycle has no reading."""
 class NotPutRight(Message, says="{item} was {found} and could not be {done}: {error}"): ...
 class TemperatureNotSet(Message,
     says="thermostat target {target} degC not set, tried again with the next sample: {error}"): ...
@@ -97,11 +97,11 @@ class DumpWillFail(Message, says="{items} hold no number, and measuring will end
     remedy="restart the device's software within ten minutes; the run goes on then"):
     """The device has measured or heated with a nan; every tenth cycle it writes that to its disk, and cannot."""
 class SampleLate(Message, says="a sample came {late_s:.0f} s late, or the board's clock was set back by that",
-    remedy="nothing if it is once; else look at the board's disk and terminal"):
+    remedy="if this happens once, ignore it; else look at the board's disk and terminal"):
     """One cycle took so long, or the clock was set; no dose for that sample."""
 class SampleBeforeLate(Message,
     says="the sample before came {late_s:.0f} s late, or the board's clock was set forward by that",
-    remedy="nothing if it is once; else switch clock corrections off on the board"): ...
+    remedy="if this happens once, ignore it; else switch clock corrections off on the board"): ...
 class RegulationFoundOn(Message,
     says="the on-board OD regulation was found on and switched off: this run controls"): ...
 class RegulationEnded(Message, says="on-board regulation switched off: the reactor is given up"): ...
@@ -125,8 +125,8 @@ class StillOn(DeviceStateError, says="{reactor}: {pumps} still on after the off 
     """Tried again, then the experiment is ended; the waste pump runs beside a feed pump that may run."""
 class CannotBeRead(DeviceStateError,
     says="{reactor} cannot be read: the device shows {shown}; another client keeps selecting reactors"): ...
-class OtherIdentity(IdentityError, says="{reactor} answers with identity {found}, pinned is {pinned}"):
-    """Reactors were exchanged, or the device is an emulated one, new each time: such a run cannot be resumed."""
+class OtherIdentity(IdentityError, says="{reactor} answers with identity {found}, expected {pinned}"):
+    """Reactors were exchanged, or the device is an emulator, new at each start: its run cannot be resumed."""
 class Absent(DeviceStateError, says="{reactor} is absent (present: {present})"):
     """The device does not see it; nothing is sent, as a command would end the device's software."""
 class NotSent(DeviceStateError, says="refused to send POST {path}: {reactor} was not seen present"): ...
@@ -137,12 +137,13 @@ class Forbidden(DeviceStateError,
     """An error in the program; not sent."""
 class OldAnswer(LinkError, says="an answer of an earlier time came again",
     remedy="look for a proxy or tunnel that keeps answers; connect without it"):
-    """Something between here and the device answers from its memory; not believed."""
+    """Something between here and the device answers from its memory; the answer is not used."""
 class WrongStatus(ProtocolError, says="{request}: status {status}, expected {expected}",
     remedy="check the address; restart the device's software"):
     """Something else answers, or the device's software is ill; a proxy may take a header away (403)."""
-class NotUnderstood(ProtocolError, says="device state: {what}"):
-    """A torn answer, or another software: nothing if it is once; else look at the software's version."""
+class NotUnderstood(ProtocolError, says="device state: {what}",
+    remedy="if this happens once, ignore it; else check the software's version"):
+    """A torn answer, or another software."""
 class ExperimentRuns(DeviceStateError, says="{reactor}: an experiment is running",
     remedy="stop it before pumps are weighed"): ...
 class FaultsStand(DeviceStateError, says="{faults}"): ...

@@ -35,7 +35,7 @@ class OverflowPumpConfig:
 
     @property
     def others(self) -> tuple[str, ...]:
-        """All pumps but this one: what is switched off wherever a run goes on."""
+        """All pumps except the overflow pump: those to switch off while the run continues."""
         return tuple(p for p in PUMPS if p != self.pump)
 
     def others_on(self, state: DeviceState) -> str:

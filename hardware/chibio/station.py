@@ -36,7 +36,7 @@ class ChibioStation(Station):
 
     Args: volume_ml: of its culture; else as of `DoseSequence`.
     Attributes: sampling, doses, overflow_pump, fluorescence: its parts; busy, while the reactor is being started or
-      recovered; restored, whether it goes on from what an earlier life left.
+      recovered; restored, whether it continues from the state before a resume.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class ChibioStation(Station):
         self._blank = math.nan
 
     def restore(self) -> None:
-        """Take over from an earlier life; pumps are verified off, unless the reactor regulates itself as left.
+        """Restore the state before a resume; pumps are verified off, unless the reactor regulates itself as left.
 
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
@@ -112,7 +112,7 @@ class ChibioStation(Station):
             self.busy = False
 
     def take_over(self) -> Task:
-        """Task: `bring_up` in a run that goes on meanwhile; what does not succeed is said and tried again."""
+        """Start the reactor in a run that continues meanwhile; report a failure and try again."""
         try:
             if not self.connection.read().running:
                 self.book.say(messages.StoppedMeanwhile())
@@ -247,7 +247,7 @@ class ChibioStation(Station):
         return now - self._held_s < HELD_S
 
     def _recoverable(self, kind: str, age_s: float) -> bool:
-        """Whether a fault is this program's to mend; what somebody else stopped stays so."""
+        """Return whether this program repairs a fault; an experiment stopped by someone else stays stopped."""
         own_stop = kind == "stopped" and bool(self._why_ended()) and not self.doses.running
         return kind == "restarted" or own_stop or (kind == "stalled" and age_s > self._config.lost_s)
 

@@ -17,11 +17,11 @@ POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software
 
 
 class Supervisor:
-    """Keeps one process of the software running, or none, and the requests that wait for it.
+    """Emulated gunicorn supervisor: runs at most one worker and queues its requests.
 
     Args: vials: whose power it switches.
-    `software` is what its worker runs, or ran last; `deadline`, when the request being served has taken too long;
-    `alive`, whether anybody listens; `restarts` and `exits` count.
+    Attributes: software, of the current or last worker; deadline, when the worker is killed for a slow request; alive,
+      whether requests are accepted; restarts and exits, counts.
     """
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:

@@ -76,9 +76,9 @@ def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]
 def fetch(
     client: httpx.Client, method: str, url: str, wait_s: float, body: bytes | None = None
 ) -> tuple[int, bytes, httpx.Headers]:
-    """Status, body and headers of an answer that came whole within `wait_s`, so that nobody who dribbles holds a loop.
+    """Return status, body and headers of a reply; fail unless the whole reply arrives within `wait_s`.
 
-    Raises: LinkError, whose cause is an httpx.ConnectError or ConnectTimeout where nobody was reached; ProtocolError.
+    Raises: LinkError, with cause httpx.ConnectError or ConnectTimeout if the host was not reached; ProtocolError.
     """
     what, deadline, found = f"{method} {urlsplit(url).path}", time.monotonic() + wait_s, bytearray()
     try:

@@ -73,7 +73,7 @@ class MqttLink:
         self._is_up = False
 
     def publish(self, topic: str, payload: str) -> None:
-        """Nothing where there is no connection: what is said late may do harm."""
+        """Publish; drop the message without a connection, because a late command may do harm."""
         if self.connected:
             self._client.publish(topic, payload, qos=1)
 

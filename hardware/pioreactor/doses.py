@@ -78,7 +78,7 @@ class Doses:
         return self._course is not None
 
     def restore(self, history: UnitHistory) -> None:
-        """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
+        """Restore the state before a resume; the outcome of an open dose is looked for, the dose never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
         if history.open:
             plan, self._job = Plan(history.feed_ml, history.waste_ml), ALT if history.pump == SPARE else MEDIA
@@ -139,7 +139,7 @@ class Doses:
             self._settle_strange()
 
     def take(self, events: list[Event]) -> None:
-        """Dosing events that arrived; those that are nobody's here are booked after the dose under way."""
+        """Take dosing events; book those of no dose of this run after the dose under way."""
         for event in events:
             key = event.pump, event.source
             self.pumps.reported[key] = max(self.pumps.reported[key] + event.ml, 0.0)  # a correction is negative
@@ -157,7 +157,7 @@ class Doses:
         self._conclude(plan, dose, on_s, media, waste)
 
     def _look_for(self, history: UnitHistory, plan: Plan) -> Iterator[float]:
-        """Look for the dose an earlier life left open: what became of it while nobody watched, and what still may."""
+        """Look for the outcome of the dose that was open before a resume; it may still run."""
         pumps, dose, asked_ml = self.pumps, history.id, plan.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
@@ -226,7 +226,7 @@ class Doses:
             yield STEP_S
 
     def _portion(self, ml: float, name: str) -> Iterator[float]:
-        """Have the waste pump take a portion; it counts as it is told, and in the end as it is known."""
+        """Drain a portion by the waste pump; count its reported volume, in the end its known volume."""
         before_ml, course, over = self._taken_ml, self.pumps.give(WASTE, ml, name), False
         self._book.tell(messages.Drained(ml=ml))
         while not over:

@@ -1,4 +1,4 @@
-"""MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's."""
+"""MQTT of a cluster: the newest reports of each unit, stored by a listening thread, read by the driver's."""
 
 import json
 import math
@@ -38,7 +38,7 @@ class Reading(NamedTuple):
 
 
 class Event(NamedTuple):
-    """One dosing event: which pump job, mL (told before they are pumped), who asked for it."""
+    """One dosing event: pump job, mL (reported before they are pumped), who requested it."""
 
     pump: str
     ml: float
@@ -46,7 +46,7 @@ class Event(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a job last said of itself, and when; a retained word is of unknown age, -inf."""
+    """Last state that a job reported, and when; a retained message has unknown age, -inf."""
 
     word: str = ""
     at: float = -math.inf
@@ -96,14 +96,14 @@ class Pin:
 
 
 class Mailbox:
-    """What one unit said; filled by `take`, which may be called from another thread. Times are real seconds.
+    """Reports of one unit; filled by `take`, which may be called from another thread. Times are real seconds.
 
-    A retained message of another experiment is of no time that is known, and left out.
+    A retained message of another experiment has no known time and is ignored.
 
     Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; jobs,
       pin number of each pump's job; pins, what is known of each; states, of each job by experiment; temperature,
-      target, of the thermostat, degC; stir_duty, %; heard_s, when the unit last said anything; dc_s, when it last told
-      its pins; complaint, why its reader took no reading, by its log.
+      target, of the thermostat, degC; stir_duty, %; heard_s, when the unit last sent anything; dc_s, when it last
+      reported its pins; complaint, why its reader took no reading, by its log.
     """
 
     def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
@@ -122,7 +122,7 @@ class Mailbox:
         self.complaint, self._stamp, self._said = "", "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
-        """Take a message; one that is not understood is left out, and its kind said once. Raises: nothing."""
+        """Take a message; ignore an invalid one and note its kind once. Raises: nothing."""
         experiment, _, rest = topic.removeprefix(self._root).partition("/")
         try:
             with self.lock:
@@ -204,7 +204,7 @@ class Mailbox:
         self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:
-        """Forget what jobs said of themselves, before they say it again; a pump's job ends with the broker."""
+        """Forget the states of jobs before they report them again; a pump's job ends with the broker."""
         with self.lock:
             self.states.clear()
             for pin in self.pins.values():
@@ -251,7 +251,7 @@ class Cluster(MqttLink):
         )  # fmt: skip
 
     def _forget(self) -> None:
-        """After a break: what was said before it may have changed since; what is retained is said again."""
+        """Forget, after a broken connection, reports that may have changed; retained ones arrive again."""
         self._others.clear()
         for box in self._boxes.values():
             box.forget()
@@ -266,11 +266,11 @@ class Cluster(MqttLink):
             self._boxes[unit].take(topic, payload, retained)
 
     def hold(self) -> None:
-        """Tell every other client of this cluster that these units are ours, as long as we are there."""
+        """Announce to other clients of this cluster that this program controls these units while connected."""
         self.keep(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)}))
 
     def holder(self, unit: str) -> OtherClient | None:
-        """Who else controls a unit, None if nobody does; an earlier life of the same run is nobody."""
+        """Return the other client that controls a unit, or None; an earlier process of this run does not count."""
         for topic, said in list(self._others.items()):
             if unit in said["units"]:
                 pid, host = str(said.get("pid"))[:20], str(said.get("host"))[:60]

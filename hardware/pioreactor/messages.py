@@ -1,4 +1,4 @@
-"""What a Pioreactor and its driver tell while a run goes on: faults, notes on doses, failed requests."""
+"""Messages of a Pioreactor and its driver during a run: faults, notes on doses, failed requests."""
 
 from conf.messages import Message
 from hardware import messages as any_kind
@@ -8,7 +8,7 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError
 
 class NoBroker(any_kind.LinkFault, says="no MQTT broker at {broker}: {why}; doses wait",
     remedy="look at the leader's power and network; on the leader: sudo systemctl restart mosquitto"):
-    """No readings, and nothing is heard of the pumps; connects again by itself."""
+    """No readings and no reports of the pumps; connects again by itself."""
 class WebServerSilent(any_kind.LinkFault, says="its web server: {why}; doses wait", remedy="else reboot the unit"): ...
 class NotBroughtUp(any_kind.LinkFault, says="{error}", remedy="the others go on, and this one is tried again"): ...
 class FateUnknown(any_kind.PumpFault, says="a dose of {ml:.2f} mL ({job}) was not seen to begin: its fate is unknown",
@@ -16,24 +16,24 @@ class FateUnknown(any_kind.PumpFault, says="a dose of {ml:.2f} mL ({job}) was no
     """Nothing came of the request; it is never sent again."""
 class BeingVerified(any_kind.PumpFault, says="the {pump} pump (pin {pin}) is being verified off after {job}, {how}",
     remedy="wait a minute"):
-    """A pump job ended without a word or does not end, and its unit does not tell its pump on."""
+    """A pump job ended without a report or does not end; the unit does not report the pump on."""
 class RunsOn(any_kind.PumpFault, says="the {pump} pump (pin {pin}) runs on after {job}, {how}",
     remedy="pull its plug, or on the unit: {purge} pwm_locks {pin} --as-int"):
-    """The unit tells that the pump is on; the waste pump prevents an overflow. The alarm ends by itself."""
+    """The unit reports the pump on; the waste pump prevents an overflow. The alarm ends by itself."""
 class MayRunOn(any_kind.PumpFault, says="the {pump} pump (pin {pin}) may run on after {job}, {how}",
     remedy="look at it; if it runs, pull its plug, or on the unit: {purge} pwm_locks {pin} --as-int"):
     """Nothing proved it off in 20 s, and the unit may not know that it is on. The alarm ends by itself."""
-class PinsUntold(any_kind.PumpFault, says="the unit told nothing of its pins when one was switched",
+class PinsUntold(any_kind.PumpFault, says="the unit did not report its pins when one was switched",
     remedy="stop and start stirring in the vendor's page, else reboot the unit"):
-    """No dose can be followed; stirring is switched and listened to again."""
+    """No dose can be followed; stirring is switched again and its report awaited."""
 class OtherClient(any_kind.ModeFault, says="process {pid} on {host} controls {unit}: one client per unit",
     remedy="end one of the two; if it is not there any more: mosquitto_pub -r -n -t {topic}"): ...
 class Astray(any_kind.ModeFault, says="{why}", remedy="assign it to {experiment}, active, in the vendor's page"):
     """The unit is in another experiment, inactive or removed: the vendor's jobs do not run there."""
-class VendorDoses(any_kind.ModeFault, says="{job} of the vendor's runs", remedy="stop it in the vendor's page"):
+class VendorDoses(any_kind.ModeFault, says="the vendor's {job} is running", remedy="stop it in the vendor's page"):
     """A job that drives several pumps; counted by its events and by the pumps' pins."""
-class ForeignDose(any_kind.ModeFault, says="{job} of {ml:.2f} mL more without our command ({who})",
-    remedy="one client per unit; find who it was; it is counted"): ...
+class ForeignDose(any_kind.ModeFault, says="{job} of {ml:.2f} mL not commanded by this run ({who}); booked",
+    remedy="use one client per unit; find the other one"): ...
 class ReaderComplains(any_kind.StoppedFault, says="the unit takes no OD readings, its log says: {log}",
     remedy="do what that says, else reboot the unit; doses wait"):
     """The reader runs and publishes nothing. Below the blank: clear or renew the experiment's OD blank."""
@@ -58,18 +58,18 @@ class NotCarriedOut(Message, says="accepted and not carried out",
     remedy="if the unit's log names a lock on the pin, on the unit: {purge} pwm_locks {pin} --as-int"): ...
 class ForgottenByRestart(Message, says="not carried out: the unit was started again, which forgets requests",
     remedy="look at the unit's power supply"): ...
-class ToldLess(Message, says="{told_ml:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"): ...
-class RanLonger(Message, says="its pin was on for {ran_ml:.2f} mL, {told_ml:.2f} mL were told"): ...
+class ToldLess(Message, says="{told_ml:.2f} of {ml:.2f} mL reported: ended early, or its last event was not sent"): ...
+class RanLonger(Message, says="the pump ran for {ran_ml:.2f} mL, its job reported {told_ml:.2f} mL"): ...
 class EndedFromHere(Message, says="ended from here"): ...
 class StartedAgainInDose(Message, says="the unit was started again in it"): ...
 class EndUnseen(Message, says="its end was not on record: at most what was asked, unless its pump was found on"): ...
-class PerhapsHeard(Message, says="{job}: whether it was heard is unknown: {error}", remedy="look at the network"): ...
+class PerhapsHeard(Message, says="{job}: unknown if the unit received it ({error})", remedy="check the network"): ...
 class RanLate(Message, says="{job} of {ml:.2f} mL ran late", remedy="look at the unit's load"): ...
 class Drained(Message, says="{ml:.1f} mL of waste: the vial is drained of what the media pump gives that runs on",
     remedy="look at the level; if it is not at its tube: python -m experiments.mark run=RUN reactor=NAME level_ml=ML"):
     """Too full: the waste pump runs, once nothing asks for pumps off."""
 class GivenBeside(Message, says="{why}: {low_ml:.2f} to {high_ml:.2f} mL"):
-    """A pump gave what no dose of this run asked for; counted. See the faults of kind mode."""
+    """A pump gave a volume that this run did not request; booked. See the faults of kind mode."""
 class NotHeard(LinkError):
     """A request that certainly was not carried out: nobody was reached, or it was turned away."""
 class NobodyReached(NotHeard, says="{error}",
@@ -86,8 +86,8 @@ class BrokerRefuses(LinkError, says="MQTT broker {broker}: {why}",
     remedy="check backend.username, and its password in backend.password_file or the environment"): ...
 class QueueStuck(LinkError, says="the task queue takes nothing, so a dose would run at any time",
     remedy="on the unit: sudo systemctl restart huey"): ...
-class AutomationRuns(DeviceStateError, says="a dosing automation of the vendor's runs, and would dose too",
-    remedy="stop it in its page"): ...
+class AutomationRuns(DeviceStateError, says="a dosing automation of the vendor is running and would also dose",
+    remedy="stop it in the vendor's page"): ...
 class NotCalibrated(DeviceStateError, says="no active calibration of the {pump} that gives mL per second",
     remedy="calibrate it in the vendor's page (Calibrations, {pump}); doses in mL are refused without"): ...
 class UnitPumpOn(DeviceStateError, says="pumps of {unit}: {pump} (pin {pin}) on: {why}", remedy="pull its plug"): ...

@@ -138,12 +138,12 @@ class Pumps:
         return boot_of(rows) not in ("", self.boot)
 
     def told_on(self, job: str) -> bool:
-        """Whether the unit tells that a pump is on, since the broker is there, and not because of a short run."""
+        """Return whether the unit reports a pump on since the broker is connected, except by a short run."""
         pin, broke_s, before_s = self.pins[job], self.mqtt.broke_s, self.clock.now() - SETTLE_S
         return pin.on and pin.on_s < before_s and (broke_s <= pin.on_s or broke_s < self.box.dc_s < before_s)
 
     def ask_pins(self) -> None:
-        """Have stirring say all pins again: by a duty that differs a little, for newer versions tell only changes."""
+        """Have stirring report all pins again: change its duty a little, as newer versions report only changes."""
         if not math.isnan(duty := self.box.stir_duty):
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
 
@@ -257,13 +257,13 @@ class Pumps:
         return why
 
     def last_word(self, request: Request) -> str:
-        """Return what the job of a run last said of itself; "" is unknown: two processes share a topic, or it broke."""
+        """Return the last state that the job reported; "" is unknown: two processes share a topic, or it broke."""
         pin, state = self.pins[request.job], self.box.state(request.job)
         alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
         return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
 
     def _is_over(self, request: Request) -> bool:
-        """Whether a job has said that it ended, its pin stands still, and its last event is there or will not come."""
+        """Return whether a job reported its end, its pin is still, and its last event is there or will not come."""
         state, pin, asked_s = self.box.state(request.job), self.pins[request.job], request.asked_s
         told = pin.on_s >= asked_s and state.word == "disconnected" and state.at >= asked_s  # whoever's word that was
         ended = (told or self.last_word(request) == "disconnected") and not pin.on
@@ -417,7 +417,7 @@ class ForcedEnd:
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
-        """Return what a pump that runs on, or told no end, moved up to now, mL; 0 once its bottle is empty."""
+        """Return the volume so far of a pump that runs on or reported no end, mL; 0 once its bottle is empty."""
         p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s

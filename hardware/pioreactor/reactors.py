@@ -61,7 +61,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
             if not histories or len(failed) == len(past):
                 raise error.about(station.name)
             screen.warning("%s: not taken over, the others go on: %s", station.name, error)
-            station.lie_down(error, past[station])
+            station.postpone_start(error, past[station])
 
     def connect(self) -> None:
         """Wait for the broker to let us in, and for what it retains. Raises: LinkError."""

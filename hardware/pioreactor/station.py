@@ -80,7 +80,7 @@ class PioreactorStation(Station):
         self.up, self.sampling.arrived_s = True, self._clock.now()  # the first sample is waited for from now on
 
     def hear_pins(self) -> Iterator[float]:
-        """Course: switch a pin, that of stirring, until the unit tells it, for at most a minute."""
+        """Switch the stirring pin until the unit reports it, for at most a minute."""
         until_s, box = self._real.now() + UNSTARTED_S, self._box
         own = math.isinf(box.dc_s) and not box.live(STIR) and STIR not in self._asked_s
         with suppress(ReactorError):
@@ -92,7 +92,7 @@ class PioreactorStation(Station):
             yield from self._end_job(STIR) if own else ()
         self._listened = True
 
-    def lie_down(self, error: ReactorError, history: UnitHistory) -> None:
+    def postpone_start(self, error: ReactorError, history: UnitHistory) -> None:
         """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
         self.book.report(messages.NotBroughtUp(error=error))
         self._course = self._rise(history)
@@ -104,7 +104,7 @@ class PioreactorStation(Station):
         try:
             yield from self.bring_up(history)
         except ReactorError as error:
-            self.lie_down(error, history)
+            self.postpone_start(error, history)
 
     def _start(self, job: str) -> Iterator[float]:
         options, overrides = request(job, self._config, self._pumps.facts, self._target, self.regulated_od)
@@ -113,7 +113,7 @@ class PioreactorStation(Station):
         self.book.log("command", job=job, options=options)
 
     def go_on(self) -> None:
-        """Take in what the unit said, and go on with a dose and what else is under way."""
+        """Take the unit's reports; continue the dose and other tasks under way."""
         course = self._course
         if course is not None and next(course, None) is None and self._course is course:
             self._course = None
@@ -249,7 +249,7 @@ class PioreactorStation(Station):
         self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Send the thermostat its target until it says it; one that hears nothing any more is started anew."""
+        """Send the thermostat its target until it reports it; restart one that no longer responds."""
         if not self._target_sent_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
@@ -262,7 +262,7 @@ class PioreactorStation(Station):
             self._listed.discard(HEAT)
 
     def pumps_off(self, real_s: float = PUMPS_S, final: bool = False) -> Iterator[float]:
-        """Course: every pump off, verified; a dose is cut, waste only if final. Raises: DeviceStateError."""
+        """Switch every pump off, verified; cut a dose, its waste only if final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
         pumps.barred = PUMPS if final else (MEDIA, ALT)
         try:
@@ -284,19 +284,19 @@ class PioreactorStation(Station):
             pumps.barred = PUMPS if final else ()
 
     def give_up(self) -> Iterator[float]:
-        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
+        """End all dosing for the rest of the run, also by the vendor's turbidostat. Raises: as `pumps_off`."""
         self.given_up, self.regulated_od = True, math.nan
         if self._there(AUTOMATION):
             yield from self._end_job(AUTOMATION)
         yield from self.pumps_off(self._config.stop_s, final=True)
 
     def heat_off(self) -> Iterator[float]:
-        """Course: thermostat ended for the rest of the run. Raises: DeviceStateError."""
+        """End the thermostat for the rest of the run. Raises: DeviceStateError."""
         self.heat_is_off = True
         yield from self._end_job(HEAT)
 
     def _end_job(self, job: str) -> Iterator[float]:
-        """One of the vendor's jobs ended, by MQTT and by HTTP. Raises: DeviceStateError if it goes on."""
+        """End one of the vendor's jobs by MQTT and HTTP. Raises: DeviceStateError if the job still runs after 8 s."""
         deadline = self._real.now() + 8.0
         while self._box.live(job):
             if self._real.now() > deadline:
@@ -307,7 +307,7 @@ class PioreactorStation(Station):
             yield STEP_S
 
     def regulate(self, setpoint: float) -> Iterator[float]:
-        """Course: handed over to the vendor's turbidostat for good once it says so. Raises: ReactorError."""
+        """Hand the vial over to the vendor's turbidostat; done once that runs as set. Raises: ReactorError."""
         yield from self.pumps_off(self._config.stop_s)
         self.regulated_od, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
         try:

@@ -63,7 +63,7 @@ class Web:
         return ""
 
     def astray(self, unit: str) -> str:
-        """Why a unit is none of our experiment by this leader's word, "" if it is. Raises: LinkError, ProtocolError."""
+        """Return why the leader does not list the unit in this experiment, or "". Raises: LinkError, ProtocolError."""
         try:
             said = self.get(f"/workers/{unit}/experiment", below="/api")
         except NotHeard as error:

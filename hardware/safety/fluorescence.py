@@ -1,4 +1,4 @@
-"""What each reading of fluorescence says by itself: whether a working sensor can have given it."""
+"""Validity of single fluorescence readings: whether a working sensor can give them."""
 
 import math
 
@@ -39,14 +39,14 @@ class Light:
         ]
 
     def believed(self, m: Measurement) -> Array | None:
-        """Fresh counts that may be believed, nan for all others, shape (N,); None where none are measured."""
+        """Return valid fresh counts, nan for all others, shape (N,); None if none are measured."""
         if m.fluorescence is None:
             return None
         believed, _ = self._judge(m.fluorescence, np.asarray(m.fresh, dtype=np.bool_))
         return np.where(believed, m.fluorescence, np.nan)
 
     def _judge(self, counts: Array, fresh: Mask) -> tuple[Mask, Array]:
-        """Fresh rows that may be believed; equal samples in a row, of all."""
+        """Return the valid fresh rows, and the number of equal samples in a row of all rows."""
         c = self._config
         repeats = np.where(fresh, np.where(counts == self._light, self._light_repeats + 1, 0), self._light_repeats)
         inside = (counts >= c.light_min) & (counts <= RAW_MAX)  # not nan

@@ -112,7 +112,7 @@ class Interlock:
         return self._conclude(found, allowed, np.where(sound, np.clip(setpoint, 0.05, None), 0.5))
 
     def believes(self, measurement: Measurement) -> Mask:
-        """Rows whose fresh reading may be acted on, shape (N,); asked before `check`, changes nothing.
+        """Return rows whose fresh reading is valid for control, shape (N,); called before `check`, changes nothing.
 
         A step that nothing explains may be only where `jump` is no more than reported.
         """
@@ -122,11 +122,11 @@ class Interlock:
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
 
     def fluorescence(self, measurement: Measurement) -> Array | None:
-        """Fresh counts that may be believed, else nan, shape (N,), or None; asked before `check`, changes nothing."""
+        """Return valid fresh counts, else nan, shape (N,), or None; called before `check`, changes nothing."""
         return self._light.believed(measurement)
 
     def command(self, actuator: Actuator, asked: Array) -> Array:
-        """Cut what a signal asks of an actuator to its limits, (N,); nan stays. The next `check` tells of it."""
+        """Cut what a signal asks of an actuator to its limits, (N,); nan stays. The next `check` reports the cut."""
         low, high = actuator.low, actuator.high
         if actuator.pump:
             low, high = 0.0, self.bench.max_rate
@@ -180,14 +180,14 @@ class Interlock:
         return Response.HOLD if isinstance(fault, PAUSES) else self.config.response(fault)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
-        """Book the receipt of a command at a time, s; without a waste pump in the model the level stays at its tube."""
+        """Book the receipt of a command at `now`, s; without a waste volume the level is taken to stay at the tube."""
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         self.budget.book(feed, waste, now)
         self._change.dosed(feed, feed if receipt.low_ml is None else np.asarray(receipt.low_ml))
 
     def refilled(self, row: int, bottle_ml: float) -> None:
-        """Go on with a bottle that holds so much now: what an empty one has led to is over."""
+        """Set the bottle's volume after a refill and end the pause that an empty bottle caused."""
         self.budget.bottle_ml[row] = self.budget.fed_ml[row] + bottle_ml
         self._change.refilled(row)
         if self._hold_kind[row] == PAUSES.index(messages.NoDilutionPause):

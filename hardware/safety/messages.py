@@ -2,7 +2,7 @@
 
 from hardware.messages import Fault, UndosedFault
 
-# A reason that means the sensor cannot be believed may not regulate: the device would pump by the same reading.
+# A reason that means the sensor is invalid may not regulate: the device would pump by the same reading.
 # fmt: off
 
 
@@ -10,8 +10,8 @@ class FallsFault(Fault, says="OD fell from {before:.3f} to {od:.3f}: no dose exp
     remedy="does liquid flow? Pull the feed tube out of the bottle; else check vial and stirrer", response="pumps_off"):
     """A pump runs on, a leak, a moved vial or a stopped stirrer; once certain, no dose for some minutes."""
 class SlowFallFault(FallsFault, says="ln OD is {below:.2f} below what growth and doses explain"):
-    """The same, in small steps."""
-class FallsPause(FallsFault, says="no dose for another {minutes:.1f} min after this"):
+    """OD fell in small steps."""
+class FallsPause(FallsFault, says="no dose for another {minutes:.1f} min after the fall"):
     """The pause after such a fall."""
 class OverflowFault(Fault, says="room for {left_ml:.2f} mL in the vial, {asked_ml:.2f} mL asked",
     remedy="check waste pump and tube; mark the level: python -m experiments.mark run=RUN reactor=NAME level_ml=ML",
@@ -21,8 +21,8 @@ class NoDilutionFault(Fault, says="ln OD is {above:.2f} too high: some or all of
     remedy="check bottle (filled: mark it, bottle_ml=ML), feed tube and gasket; clean the vial's wall",
     response="hold"):
     """OD rose as if no dose was given; no dose for some minutes, then tried again."""
-class NoDilutionPause(NoDilutionFault, says="no dose for another {minutes:.1f} min after this"):
-    """The pause after that."""
+class NoDilutionPause(NoDilutionFault, says="no dose for another {minutes:.1f} min after the failed dilution"):
+    """The pause after a dose that did not dilute."""
 class CannotHoldFault(Fault, says="full feed does not bring OD down to {setpoint:g}",
     remedy="check bottle and tube, weigh the doses; else start a new run that is colder or has a higher setpoint",
     response="report"):
@@ -39,10 +39,10 @@ class BudgetFault(Fault, says="{left_ml:.2f} mL left of the feed budget, {asked_
     """The feed of a minute, an hour or the run is used up; no dose until there is room again."""
 class JumpFault(Fault, says="OD rose from {before:.3f} to {od:.3f}: growth cannot do that",
     remedy="wait five minutes, then check for bubbles, foam and a moved vial", response="hold"):
-    """As a rule a bubble; believed after six readings that agree."""
-class ImpossibleFault(Fault, says="OD {od:.3f} at {raw:.0f} counts: possible is {low:g} to {high:g}",
+    """As a rule a bubble; accepted after six readings that agree."""
+class ImpossibleFault(Fault, says="OD {od:.3f} at {raw:.0f} counts is out of range; possible: {low:g} to {high:g}",
     remedy="check cable, vial and blank", response="hold"):
-    """No culture and no vial reads so."""
+    """No culture or vial can give this reading."""
 class SpectrometerFault(Fault, says="OD {od:.2f} at {raw:.0f} counts: the light sensor failed",
     remedy="check the spectrometer's cable; restart the device if it persists", response="pumps_off"):
     """The light sensor fails: OD 12 to 14, or hardly a count."""
@@ -67,26 +67,26 @@ class ThermometerFault(Fault, says="reads {temperature:.1f} degC: heating off",
     """The thermometer reads nonsense; the heater stays off in this run, doses go on."""
 class SetpointFault(Fault, says="setpoint OD {setpoint:g}: allowed above 0 to {most:g}",
     remedy="correct the schedule, start a new run", response="hold"):
-    """No culture is held there."""
+    """No culture can be held at this setpoint."""
 class LimitFault(Fault, says="{rate:g} mL/s cut to {most:g} mL/s",
-    remedy="nothing if the controller asked too much; else raise bench.max_rate", response="report"):
-    """The controller asked for more than the largest rate: cut."""
+    remedy="ignore it if the controller requested too much; else raise bench.max_rate", response="report"):
+    """The controller requested more than the largest rate: cut."""
 class ControllerFault(Fault, says="proposed {rate:g} mL/s",
-    remedy="nothing if it is once; see the policy's input and output in journal.jsonl", response="hold"):
+    remedy="if this happens once, ignore it; else see the policy's input and output in journal.jsonl", response="hold"):
     """The controller proposed no number, or a negative one."""
 class ControllerLostFault(Fault, says="{count:.0f} unusable proposals in a row",
     remedy="replace the policy, then start a new run", response="regulate"):
-    """And that several times in a row: the device holds the last setpoint."""
+    """The controller failed several times in a row: the device holds the last setpoint."""
 class CommandLimitFault(Fault, says="{actuator}: {asked:.4g} {unit} asked, allowed {low:g} to {high:g}",
-    remedy="nothing if the controller asked too much; else set the limits of safety",
+    remedy="ignore it if the controller requested too much; else set the limits of safety",
     response="report"):
     """A temperature or another command was out of range: cut."""
 class FluorescenceFault(Fault, says="{counts:.0f} counts, the same in {samples:.0f} samples",
-    remedy="nothing if it is once; else check LED, spectrometer and the slot's gain", response="report"):
-    """No culture reads so, or no reading at all (nan); not shown to the controller."""
-class FluorescenceLostFault(Fault, says="no reading to believe for {minutes:.0f} min, now {counts:.0f} counts",
+    remedy="if this happens once, ignore it; else check LED, spectrometer and the slot's gain", response="report"):
+    """Impossible, frozen or missing (nan) reading; the controller does not see it."""
+class FluorescenceLostFault(Fault, says="no valid reading for {minutes:.0f} min, now {counts:.0f} counts",
     remedy="check LED and spectrometer, then look at the device's FP slot", response="report"):
-    """What it tells is not seen; a model alone carries that on."""
+    """Fluorescence is unavailable; the share estimate continues from the model alone."""
 
 
 PAUSES = (NoDilutionPause, FallsPause)

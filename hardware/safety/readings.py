@@ -66,7 +66,7 @@ class Readings:
         return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
     def _judge(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Mask, Array]:
-        """Fresh rows: believed, of a failed sensor, that no culture reads, frozen; of all: equal samples in a row."""
+        """Return fresh rows: valid, of a failed sensor, impossible, frozen; of all rows: equal samples in a row."""
         c, od, raw = self._config, m.od, self._raw(m)
         with np.errstate(invalid="ignore"):
             broken = fresh & ((od > 10.0) | (raw < RAW_MIN))
@@ -77,7 +77,7 @@ class Readings:
         return believed, broken, impossible, frozen, repeats
 
     def _ages(self, m: Measurement, fresh: Mask, now: float) -> list[Finding]:
-        """How old the newest sample is, on this computer's clock or by what the driver says, whichever is more."""
+        """Find samples that are too old, by this computer's clock or by the driver, whichever age is larger."""
         self._fresh_s = np.where(fresh | np.isnan(self._fresh_s), now, self._fresh_s)
         age = now - self._fresh_s
         if m.vitals is not None:
@@ -89,11 +89,7 @@ class Readings:
         return [Finding(fault, mask, {"age_s": age}) for fault, mask in rows.items()]
 
     def resumed(self) -> None:
-        """Restart the age of the newest sample.
-
-        While the program was gone nobody could have seen a sample: a reactor is stale, lost or silent only once it
-        had its chance.
-        """
+        """Restart the age of the newest sample at zero: no sample could be taken while the program was stopped."""
         self._fresh_s = np.full_like(self._fresh_s, math.nan)
 
 

@@ -15,10 +15,10 @@ PERSISTENCE = 3  # samples in a row
 
 
 class UnexplainedChange:
-    """The newest believed reading of N reactors, what was dosed since, and what of the changes nothing explains.
+    """The newest accepted reading of N reactors, the doses since, and the changes that they do not explain.
 
-    A step is no culture's, and is believed only if enough later readings agree with it: a bubble goes, a vial that was
-    moved stays. What is small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
+    A culture makes no step. A step is accepted only if enough later readings agree with it: a bubble goes, a moved vial
+    stays. A change small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
     `excess` (ln OD rises more than the doses allow), `deficit` (it falls more than they explain) and `futile` (it does
     not fall at full feed). The last is no event but a condition: it lasts until the feed is no longer full, the
     setpoint is reached, or OD falls after all.
@@ -43,7 +43,7 @@ class UnexplainedChange:
         self._eased = np.zeros(n)  # samples in a row that speak against it
 
     def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
-        """Judge the readings of the `believed` rows: OD and setpoint, when they were taken, s, all of shape (N,)."""
+        """Judge the readings of the `believed` rows: OD, the times they were taken, s, and setpoint, each (N,)."""
         od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
         step, down, suspects, settled = self._steps(od, t)
         self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
@@ -63,7 +63,7 @@ class UnexplainedChange:
         return findings
 
     def takes(self, reading: Array, time_s: Array, believed: Mask) -> Mask:
-        """Find the `believed` rows from whose reading `check` would go on; arguments as there, changes nothing."""
+        """Return the `believed` rows whose reading `check` would accept; arguments as there, changes nothing."""
         step, _, _, settled = self._steps(np.where(believed, reading, math.nan), time_s / 60.0)
         return np.asarray(believed & (~step | settled))
 
@@ -83,7 +83,7 @@ class UnexplainedChange:
         return step, down, suspects, step & (suspects >= np.where(down, ACCEPT_DOWN, ACCEPT_UP))
 
     def _band(self, od: Array, minutes: Array) -> tuple[Array, Array]:
-        """Lowest and highest reading that growth, the doses since the believed one, and noise can make of `od`."""
+        """Return the lowest and highest reading that growth, doses since then, and noise can make of `od`."""
         c = self._config
         tolerance = np.maximum(c.jump, c.jump_fraction * np.abs(od))
         base = np.maximum(od, 0.0)

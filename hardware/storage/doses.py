@@ -1,4 +1,4 @@
-"""What the journal says of doses, in the rows of every family: what each gave, and what was repeated of it.
+"""Doses in the journal, in the rows of every family: volume and repetitions of each.
 
 `intent` before a dose that was commanded, `feed_on` before its pump is switched on or asked for, `dose_end` after it,
 `given` for what was dosed without a command. Each says when (run time, s), how much (feed_ml and waste_ml at most,
@@ -14,7 +14,7 @@ from hardware.errors import RecordingError
 from hardware.storage.messages import RowDamaged
 
 REPEAT_S = 63.0
-"""A row tells repetitions of a dose by their number, each so long after the one before: the period of a Chi.Bio."""
+"""Seconds between two repetitions of a dose, of which a row has the number: the period of a Chi.Bio."""
 FEEDS = {"Pump1": 1, "Pump3": 3, "Pump4": 4}  # pumps that an intent may name, and their numbers
 
 

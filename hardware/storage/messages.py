@@ -15,7 +15,7 @@ class JournalMissing(RecordingError, says="journal {path}: missing or empty",
 class RowDamaged(RecordingError, says="{path}: {what}",
     remedy="the file was changed by hand: put it back as the run wrote it, or start a new run"): ...
 class NotRecording(RecordingError, says="{path}: {why}", remedy="{help}"):
-    """Another file lies in the recording's place; not resumed."""
+    """The path holds a file that is not this recording; not resumed."""
 class WrongRow(RecordingError, says="{path}: row lacks columns {missing} and has unknown columns {unknown}",
     remedy="report it"):
     """An error in the program; the run ends."""

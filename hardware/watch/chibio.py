@@ -1,4 +1,4 @@
-"""A Chi.Bio that is only read: one GET, whose answer has the sample and what the feed pump was told since the last one.
+"""A Chi.Bio that is only read: one GET, whose reply has the sample and the feed pump's commands since the last one.
 
 The device shows the reactor that is selected in its web page. To select one is a command, so it is not done.
 """
@@ -71,7 +71,7 @@ class WatchedChiBio(Watched):
         return True, None
 
     def _fed_ml(self, data: dict[str, Any], state: DeviceState) -> float:
-        """Volume that the feed pump was told to give since the last sample: a record's duty acts until the next one."""
+        """Return the volume commanded since the last sample: a record's duty acts until the next record."""
         times, duties = (data[key].get("record", []) for key in ("time", FEED))
         n = min(len(times), len(duties))
         time, duty = np.array(times[len(times) - n :], dtype=float), np.array(duties[len(duties) - n :], dtype=float)

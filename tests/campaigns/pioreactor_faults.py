@@ -210,7 +210,7 @@ OTHERS = (
              moments=("in",), seconds=1.0, by=("takes no OD readings", "ended early"), within_s=30.0, blind=True),
     rig(
         "foreign_dose", "somebody doses 0.5 mL by hand", lambda t: t.run_job("add_media", ml=0.5, source_of_event="UI"),
-        seconds=1.0, by=("without our command",), foreign=1,
+        seconds=1.0, by=("not commanded",), foreign=1,
     ),
     rig(
         "foreign_automation", "somebody starts the vendor's turbidostat",

@@ -305,7 +305,7 @@ def after_the_hand_over(run: Run) -> None:
     run.pump(1299.0, 1.0)
 
 
-CUT = "0.70 of 1.20 mL told: ended early"
+CUT = "0.70 of 1.20 mL reported: ended early"
 VOLUMES = ("error_mean_ml", "given_ml", "booked_ml", "total_pct")  # which most of these change a little
 TAMPERED: dict[str, tuple[Callable[[Run], None], dict[str, Any], int]] = {
     # what is done to a sound run: what differs in its account, and how many lines of trouble that gives

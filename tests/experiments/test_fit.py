@@ -87,9 +87,9 @@ def test_a_large_pioreactor_runs_up_to_the_limit_of_its_vial(ml: float, tmp_path
         ("pioreactor bench.volume_ml=36", "allowed less than the vendor's limit of its vial, 36"),
         ("chibio bench.volume_ml=7", "bench.volume_ml = 7 mL of M0: allowed 10"),
         ("chibio bench.volume_ml=30", "bench.volume_ml = 30 mL of M0: allowed 10"),
-        ("chibio backend.reactors=[M0,M1] bench.volumes_ml.M1=29.5", "comes to 1.2 mL at once: allowed 0.5 mL"),
-        ("sim bench.period_s=600", "comes to 12 mL at once: allowed 5 mL .* give bench.max_rate=0.00833"),
-        ("sim safety.ml_per_minute=1", "comes to 1.2 mL at once: allowed 1 mL"),
+        ("chibio backend.reactors=[M0,M1] bench.volumes_ml.M1=29.5", "one dose of 1.2 mL: allowed 0.5 mL"),
+        ("sim bench.period_s=600", "one dose of 12 mL: allowed 5 mL .* give bench.max_rate=0.00833"),
+        ("sim safety.ml_per_minute=1", "one dose of 1.2 mL: allowed 1 mL"),
     ],
 )
 def test_what_no_vial_or_budget_can_take_is_one_line(words: str, said: str, tmp_path: Path) -> None:

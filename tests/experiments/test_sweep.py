@@ -115,7 +115,7 @@ def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, mo
         "-m", "seed=0,1", "hydra/launcher=slurm", "hydra.sweep.dir=old",
     ]  # fmt: skip
     for wrong, said in (
-        (["resume=old", "seed=3"], r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"),
+        (["resume=old", "seed=3"], r"^seed=3: .* python -m experiments\.train -m resume=old"),
         (["seed=0,2", "hydra.sweep.dir=old"], r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*folder$"),
     ):
         with pytest.raises(UserError, match=said):

@@ -15,7 +15,7 @@ from tests.vendor.bench import ROOT, Bench, Run
 TIMED = re.compile(r"\d\d:\d\d:\d\d ")
 ALARM = re.compile(r"^\d\d:\d\d:\d\d (WARNING|ERROR|CRITICAL) |^failed|^error", re.IGNORECASE)
 ROUTINE = re.compile(  # said of every run
-    r"(INFO|WARNING) (pass|note)  |policy|never weighed|the interlock told|kept for the next dose|supervisor's law acts"
+    r"(INFO|WARNING) (pass|note)  |policy|never weighed|interlock alarms|kept for the next dose|supervisor's law acts"
     r"|setpoint .* from minute|writes to|recordings|next, all of it|ISE|of schedule|well again|verified off"
     r"|stopped by the operator"
 )
