@@ -120,6 +120,16 @@ def test_variance_of_a_correlated_sum_against_its_formula() -> None:
     assert np.var(sums) == pytest.approx(exact, rel=0.25)  # the simulation itself is right
 
 
+@pytest.mark.parametrize("dt", [0.5, 2.0])
+def test_the_memory_of_growth_is_in_minutes_whatever_the_rows(dt: float) -> None:
+    """Without pump and noise ln(OD) tells growth; after the correlation time 1/e of its fluctuation is left."""
+    config = OpenLoop(noise=0.0, growth_cv=0.2, growth_memory_min=30.0, hours=1.0, control_min=dt)
+    _, od, _, _ = recordings(config, lambda t, od: np.zeros(len(od)), np.random.default_rng(5), 4000)
+    growth = np.diff(np.log(od), axis=1)[:, [5, 5 + round(30.0 / dt) - 1]]
+    lag = config.growth_memory_min - dt
+    assert np.corrcoef(growth.T)[0, 1] == pytest.approx(np.exp(-lag / 30.0), abs=0.06)
+
+
 def coverage(config: OpenLoop, n: int, seed: int) -> tuple[float, float]:
     time, od, pump_rate = open_loop(config, np.random.default_rng(seed), n)
     found = [fit(series(time, od[i], pump_rate[i])) for i in range(n)]

@@ -347,3 +347,10 @@ def test_the_second_filter_s_alarm_is_said_of_the_culture_that_is_steered_and_be
     assert [None if line is None else line.partition(":")[0] for line in found.warnings] == [
         None, "filter_alarm", None, "filter_alarm",
     ]  # fmt: skip
+
+
+def test_in_a_vial_of_another_volume_a_controller_is_told_of_doses_as_of_the_model_s() -> None:
+    """What was put off, too: 14 mL in place of 20 make .5 mL, of which .2 were put off, to 1 of .7."""
+    law = Listening()
+    Density(law, scale=np.array([0.7])).dosed(np.array([0.5]), np.array([0.2]), np.ones(1, dtype=np.intp))
+    assert law.told == pytest.approx(1.0)

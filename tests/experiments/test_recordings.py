@@ -122,6 +122,11 @@ def test_every_format_tells_the_same_readings_and_doses(tmp_path: Path, form: st
     np.testing.assert_allclose(60.0 * r.pump_rate[:-1] * np.diff(r.time_min), DOSE[:-1], atol=1e-9)
 
 
+def test_a_dose_at_the_time_of_a_reading_counts_from_that_reading_on(tmp_path: Path) -> None:
+    r = read(tmp_path, data=csv(log(OD)), doses=csv(log(DOSE)))
+    np.testing.assert_allclose(60.0 * r.pump_rate[:-1] * np.diff(r.time_min), DOSE[:-1], atol=1e-9)
+
+
 @pytest.mark.parametrize("form", ["beside", "dose", "fed"])
 def test_a_dose_in_seconds_of_a_pump_lasts_so_long(tmp_path: Path, form: str) -> None:
     """A reading every 10 s: 25 s from a reading on are in three rows, and their volume is kept."""

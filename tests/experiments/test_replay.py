@@ -8,6 +8,7 @@ import pytest
 
 from conf import presets
 from conf.schema import build
+from envs.bench import Bench
 from envs.identification.calibration import calibrate
 from envs.identification.screening import Series
 from envs.plant.plant import Plant, PlantConfig
@@ -18,6 +19,7 @@ from experiments.laws import registry
 from experiments.laws.base import Controller
 from experiments.loop.loop import ClosedLoop
 from experiments.replay import ReplayConfig
+from experiments.replays.figure import replay_figure
 from experiments.replays.replay import replay
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
@@ -63,6 +65,19 @@ def test_doses_that_were_not_given_are_never_added_up(kind: str) -> None:
     assert found.decided_ml[-20:].min() > 0.0
     assert found.given_ml.sum() == 0.0
     assert not any("undosed" in reason for reason in found.reasons)
+
+
+def test_the_figure_draws_the_gain_in_per_cent_over_hours_and_each_dose_in_ml() -> None:
+    """Rows 2 min apart: a constant rate decides twice the volume of a minute's."""
+    time = 2.0 * np.arange(60)
+    series = Series(time, 0.5 + 0.001 * np.arange(60) % 7, np.zeros(60), np.arange(60))
+    made = registry.build(registry.config("hold"), model=MODEL)
+    interlock = WatchedInterlock(1, SafetyConfig(), Bench(period_s=120.0))
+    found = replay(series, np.full(60, 37.0), made, interlock, 0.5, MODEL)
+    np.testing.assert_allclose(found.decided_ml[5:], 120.0 * MODEL.mu * MODEL.tau)
+    axes = replay_figure(found, "").axes
+    np.testing.assert_array_equal(axes[2].lines[0].get_xydata(), np.stack([time / 60.0, 100.0 * found.gain], 1))
+    np.testing.assert_allclose(axes[3].lines[1].get_ydata(), found.decided_ml[found.decided_ml > 0.0])
 
 
 def test_the_second_half_is_predicted_by_the_first_better_than_by_guesses() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from conf import presets
 from conf.schema import build
@@ -21,6 +22,7 @@ from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.signals import AIM
 from experiments.record.recovery import load_state
+from hardware.reactor import Receipt
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
@@ -183,4 +185,20 @@ def test_what_is_put_off_is_told_once_across_a_kill(request_, tmp_path, monkeypa
     assert run.told_ml() == pytest.approx(run.asked_ml() - (0.0 if REQUESTS[request_] else 0.48), abs=1e-3)
     list(run.run(run.clock.now() + 240.0))
     assert run.told_ml() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]) + run.put_off_ml(), abs=1e-3)
+    run.close()
+
+
+def test_after_a_kill_an_open_dose_counts_when_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed in minute 6 and resumed 400 s later; a budget of an hour or a day must not have the dose as of now."""
+    booked, book = list[float](), ClosedLoop.book
+
+    def noted(loop: ClosedLoop, receipt: Receipt, at_s: float, pump: NDArray[np.intp]) -> None:
+        booked.append(at_s)
+        book(loop, receipt, at_s, pump)
+
+    run = Cut(tmp_path, next(name for name, given in REQUESTS.items() if given), 0.02, monkeypatch)
+    run.wait(400.0)
+    monkeypatch.setattr(ClosedLoop, "book", noted)
+    run.begin()
+    assert 300.0 < min(booked) < 450.0
     run.close()
