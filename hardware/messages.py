@@ -46,11 +46,11 @@ class PumpFault(Fault, response="pumps_off"): ...
 class OverflowPumpFault(Fault, response="hold"): ...
 class UndosedFault(Fault, response="report"): ...
 class NoDose(Message, says="no dose: {why}"):
-    """Nothing was begun for this sample; the culture grows undiluted."""
+    """No dose was begun for this sample; the culture grows undiluted."""
 class NoNewSample(Message, says="no new sample"):
-    """The sample was answered already, or none came yet."""
+    """The sample was already used, or none has arrived yet."""
 class DoseUnderWay(Message, says="the previous dose has not ended"):
-    """Its pumps are not yet verified off; if that stays, see the fault of kind pump."""
+    """Its pumps are not yet verified off; if this persists, see the fault of kind pump."""
 class OpenDose(Message, says="a dose of {ml:.2f} mL was open when the program ended",
     remedy="look at the level and at the bottle"):
     """The program was killed in a dose; the next note has its volume, if not as planned."""

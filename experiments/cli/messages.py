@@ -1,4 +1,4 @@
-"""What a command tells of itself while a reactor runs."""
+"""Messages of a command while a reactor runs."""
 
 from conf.messages import Message
 

@@ -9,7 +9,7 @@ class HookDropping(Message, says="notify: messages are dropped, the hook does no
     """More than 32 wait; the newest are dropped and counted; the screen has them all."""
 class HookFailed(Message, says="notify: {hook} did not take a message ({why}); the run goes on",
     remedy="look at network and address; run a command by hand with a line of JSON on its input"):
-    """Not reached, refused or failed; tried once for 10 s, said once, counted."""
+    """Not reached, refused or failed; tried once for 10 s, reported once, counted."""
 class HookTally(Message,
     says="notify: {hook} took {sent} messages; {failed} failed, {dropped} dropped, {left} left at the end"): ...
 class HookUnusable(Message, says="{why}", remedy="then resume again; until then nothing is sent"):
@@ -31,7 +31,7 @@ class VolumesDiffer(Message,
 class PlantIgnored(Message, says="plant: backend={backend} has vials of its own, plant.* changes nothing there",
     remedy="an emulator takes backend.plant"): ...
 class PolicyDoubtful(Message, says="policy: {why}"):
-    """At the start: it runs all the same."""
+    """At the start; the policy is used nevertheless."""
 class CannotResume(UserError, says="resume={run}: {why}"): ...
 class KnowsThePlant(UserError, says="controller = {controller}: knows a simulated plant",
     remedy="allowed with backend=sim only, not backend={backend}"): ...

@@ -1,4 +1,4 @@
-"""What the closed loop tells, and why a signal does not fit the reactors of a run."""
+"""Messages of the closed loop, and errors of a signal that does not fit the reactors of a run."""
 
 from conf.messages import Message
 from hardware.messages import Fault
@@ -8,7 +8,7 @@ from hardware.messages import Fault
 class FilterAlarm(Fault, response="report", says="readings do not fit the estimate", remedy="{then}"):
     """A jump of the OD, bubbles, chance, or wrong settings; in rows and summary, not on the screen."""
 class SignalError(Message, ValueError):
-    """A signal of the run does not fit; told at the start."""
+    """A signal of the run does not fit; raised at the start."""
 class NoSuchSignal(SignalError, says="signals.{name}: no such signal", remedy="allowed {known}"): ...
 class WrongShape(SignalError, says="{what} has the shape {shape}",
     remedy="allowed ({n},), one value for each reactor"): ...

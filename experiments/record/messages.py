@@ -6,7 +6,7 @@ from hardware.errors import RecordingError
 # fmt: off
 
 class WellAgain(Message, says="interlock: all well again"):
-    """Doses again."""
+    """Doses are given again."""
 class AlarmsTold(Message, says="{reactor}: interlock alarms of the run: {kinds}"):
     """At the end of a run: rows and time span of each kind of alarm."""
 class PhaseBegins(Message, says="{reactor}: {what} from minute {minute:.0f}, OD {od:.3f}"): ...

@@ -32,7 +32,7 @@ EVOLVER = "Experiment: "  # how the line above the two columns of an eVOLVER's f
 
 
 class Asked(NamedTuple):
-    """What somebody says of a file: arguments of `read_recording`."""
+    """User's description of a file: arguments of `read_recording`."""
 
     pump_ml_s: float
     pumps: Sequence[int]

@@ -266,7 +266,7 @@ def _note(notes: list[str], rows: Numbers, what: str) -> None:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a recording is, and what a command is told of it."""
+    """Location of a recording, and the user's options for reading it."""
 
     data: str | None = setting(
         None,
@@ -304,7 +304,7 @@ class Source:
             require(key in COLUMNS, f"columns.{key}", self.columns[key], ", ".join(f"columns.{one}" for one in COLUMNS))
 
     def read(self, path: str) -> Recording:
-        """Read a file as it is told here. Raises: RecordingError."""
+        """Read a file with these options. Raises: RecordingError."""
         first, end = (self.rows or ":").split(":")
         return read_recording(
             path,

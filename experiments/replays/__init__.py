@@ -1,4 +1,4 @@
-"""A recording gone through as by a run: what is estimated, decided and stopped, and how well it predicts.
+"""Replay of a recording as if it were a run: estimates, decisions, alarms, and how well it predicts.
 
 Entered by `replay`.
 """

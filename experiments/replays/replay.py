@@ -30,7 +30,7 @@ class _Recorded(Watched):
         self.fed_ml = 60.0 * series.pump_rate[:-1] * np.diff(series.time)
 
     def measure(self) -> Measurement:
-        """Return the next reading; what went in before it is told by `repeated`."""
+        """Return the next reading; `repeated` returns the doses before it."""
         if self._k >= 0:
             self.seen(self.elapsed(), self.fed_ml[self._k : self._k + 1])
         self._k += 1
@@ -44,7 +44,7 @@ class _Recorded(Watched):
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """What happened and what would have been decided at each of K readings, (K,) each.
+    """Events, and the decisions that a run would have made, at each of K readings, (K,) each.
 
     believed: the interlock takes the reading for the culture's. decided_ml, given_ml: doses until the next reading.
     mu: 1/min. gain: of the pump over its setting. low, high: 95 % band in which the reading was expected `AHEAD`

@@ -106,7 +106,7 @@ class Supervisor:
         yield from ()
 
     def exit(self) -> None:
-        """Exit code 4: gunicorn gives up, nobody listens any more."""
+        """Exit code 4: gunicorn gives up; no more requests are accepted."""
         self._end_process()
         self.alive = False
         self.exits += 1

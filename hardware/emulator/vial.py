@@ -1,4 +1,4 @@
-"""What stands behind the device's chips: one vial with its pumps, heater, stirrer and light path, and what can break.
+"""The hardware behind the device's chips: one vial with its pumps, heater, stirrer and light path, and what can break.
 
 Seconds are device seconds. The culture is a `Plant` with one vial; the optics (blank, counts, noise) and the
 electronics (power, motors, faults) are here, because the device sees counts, not OD.

@@ -1,4 +1,4 @@
-"""What a request over a link says when it fails; it stands in a fault of kind link, or ends a start."""
+"""Errors of requests over a link; each is part of a fault of kind link, or ends a start."""
 
 from hardware.errors import DeviceStateError, LinkError, ProtocolError
 

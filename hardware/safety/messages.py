@@ -1,4 +1,4 @@
-"""What the interlock finds wrong: its reasons, each with its sentence, remedy and response."""
+"""Faults that the interlock finds, each with its sentence, remedy and response."""
 
 from hardware.messages import Fault, UndosedFault
 
@@ -26,7 +26,7 @@ class NoDilutionPause(NoDilutionFault, says="no dose for another {minutes:.1f} m
 class CannotHoldFault(Fault, says="full feed does not bring OD down to {setpoint:g}",
     remedy="check bottle and tube, weigh the doses; else start a new run that is colder or has a higher setpoint",
     response="report"):
-    """The pump gives all that it may; doses go on for as long as that lasts."""
+    """The pump doses the permitted maximum; doses continue while this lasts."""
 class DosesNotTaken(UndosedFault, says="{owed_ml:.2f} mL were allowed, nothing was dosed",
     remedy="read the notes of the run before this line"):
     """The device took none of the doses that were allowed: link too slow, or device not as set."""

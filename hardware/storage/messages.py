@@ -1,4 +1,4 @@
-"""What the files of a run say when they cannot be written or read; it ends a run, pumps verified off, or a resume."""
+"""Errors of a run's files; each ends a run, pumps verified off, or a resume."""
 
 from conf.messages import Message
 from hardware.errors import RecordingError
@@ -19,6 +19,6 @@ class NotRecording(RecordingError, says="{path}: {why}", remedy="{help}"):
 class WrongRow(RecordingError, says="{path}: row lacks columns {missing} and has unknown columns {unknown}",
     remedy="report it"):
     """An error in the program; the run ends."""
-class MarksDamaged(RecordingError, says="{path}: damaged ({why})", remedy="mend it or move it away"): ...
+class MarksDamaged(RecordingError, says="{path}: damaged ({why})", remedy="repair it or move it away"): ...
 class TornLine(Message, says="{path}: cut a torn last line of {length} bytes"):
     """A kill or a power cut while a row was written; nothing else is lost."""

@@ -1,4 +1,4 @@
-"""What is wrong with a device that is only read."""
+"""Faults of a device that is only read."""
 
 from hardware import messages as any_kind
 
