@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = 2
+LARGEST = 1e6  # of a weight: below it, no value overflows, and none that underflows matters, in single precision
 ABSOLUTE = ("od", "setpoint")
 PREVIEW = (*ABSOLUTE, "next_setpoint", "minutes_to_change")
 RELATIVE = ("error", "growth_share")
@@ -140,6 +141,9 @@ def load(path: Path) -> Policy:
         layers = range(sum(name.startswith("w") for name in arrays))
         weights, biases = (tuple(arrays[f"{key}{k}"] for k in layers) for key in "wb")
         policy = Policy(weights, biases, metadata=metadata, **{f: arrays[name] for name, f in STORED.items()})
+        largest = float(np.max([np.max(np.abs(a), initial=0.0) for a in (*weights, *biases)]))
+        if not largest <= LARGEST:
+            raise PolicyError(f"policy {path}: a weight of size {largest:g}: allowed up to {LARGEST:g}; train it anew")
         q = policy.q_values(np.full((1, len(metadata["observation"])), 0.5))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise PolicyError(f"policy {path}: incomplete or of mismatched shapes ({error}); {remedy}") from None

@@ -20,9 +20,10 @@ FLAT = 1e-12  # a value this close to zero is on the line; far below `rounding`
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """q = W_L relu(... relu(W_1 (M z + c) + b_1)) + b_L of z in the plane; the weights are those of the file, exactly.
+    """q = W_L relu(... relu(W_1 (M z + c) + b_1)) + b_L of z in the plane.
 
-    weights (in, out) and biases (out,): the first pair is M^T and c and has no relu behind it.
+    weights (in, out) and biases (out,): the first pair is M^T and c and has no relu behind it. They are those of the
+    file, but each hidden unit is multiplied by a power of two, exactly, to a size near 1: `FLAT` is an absolute limit.
     """
 
     weights: tuple[Array, ...]
@@ -32,7 +33,12 @@ class Network:
     def of(cls, policy: Policy) -> "Network":
         weights = (policy.input_matrix.T, *policy.weights)
         biases = (policy.input_offset, *policy.biases)
-        return cls(*(tuple(np.asarray(a, dtype=np.float64) for a in arrays) for arrays in (weights, biases)))
+        w, b = ([np.array(a, dtype=np.float64) for a in arrays] for arrays in (weights, biases))
+        for k in range(1, len(w) - 1):
+            size = np.maximum(np.abs(w[k]).max(axis=0), np.abs(b[k]))
+            factor = np.exp2(-np.floor(np.log2(np.where(size > 0.0, size, 1.0))))
+            w[k], b[k], w[k + 1] = w[k] * factor, b[k] * factor, w[k + 1] / factor[:, None]
+        return cls(tuple(w), tuple(b))
 
     @property
     def hidden(self) -> list[tuple[Array, Array]]:

@@ -94,7 +94,9 @@ def _metadata(**changes: Any) -> np.ndarray:
         ({"metadata": _metadata(format=3)}, "format 3: allowed 2"),
         ({"metadata": _metadata(observation=["od"])}, "observation"),
         ({"actions": np.zeros(16)}, "17 Q values, 16 actions"),
-        ({"b2": np.full(17, np.nan, np.float32)}, "not finite"),
+        ({"b2": np.full(17, np.nan, np.float32)}, "a weight of size nan"),
+        ({"b1": np.full(64, -np.inf, np.float32)}, "a weight of size inf"),
+        ({"b0": np.full(64, -1e25, np.float32)}, "a weight of size 1e\\+25"),
         ({"w0": np.array([{"a": 1}], dtype=object)}, "not a policy file"),
         (
             {"observation_low": np.array([1.0, 0.0], np.float32), "observation_high": np.ones(2, np.float32)},

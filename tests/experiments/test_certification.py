@@ -72,6 +72,17 @@ def test_the_polygons_tile_the_rectangle_and_name_the_best_action(policy: Policy
     assert contradictions(network, exact, (64, 64)) == 0
 
 
+def test_a_hidden_unit_may_have_any_scale_and_none_hides_a_kink() -> None:
+    """A unit times c with its outputs over c is the same map, also for c far below every absolute limit."""
+    policy = laws.random(3)
+    scale = np.exp2(np.random.default_rng(0).integers(-60, 60, policy.biases[0].size)).astype(np.float32)
+    weights = (policy.weights[0] * scale, policy.weights[1] / scale[:, None], *policy.weights[2:])
+    other = replace(policy, weights=weights, biases=(policy.biases[0] * scale, *policy.biases[1:]))
+    for one, same in zip(partition(Network.of(policy), BOX), partition(Network.of(other), BOX), strict=True):
+        np.testing.assert_array_equal(one.edges, same.edges)
+        np.testing.assert_array_equal(one.action, same.action)
+
+
 @pytest.mark.parametrize("policy", [laws.law(), laws.random(5)], ids=["law", "random"])
 def test_single_precision_stays_within_the_bound_and_the_bound_is_no_guess(policy: Policy) -> None:
     points = np.random.default_rng(1).uniform(*np.transpose(BOX), (50_000, 2))
