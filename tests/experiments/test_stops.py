@@ -259,7 +259,6 @@ def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
     [
         ("tests.campaigns.soak", "state.json", "certificate.json, journal.jsonl, policy.npz, recordings/, state.json"),
         ("experiments.calibrate coverage=1000", "config.yaml", "no result"),
-        ("tests.campaigns.faults workers=2", "faults.log", "cases.csv"),  # the first case is logged
     ],
 )
 def test_a_stopped_command_says_what_it_keeps(words: str, there: str, kept: str, tmp_path: Path) -> None:
