@@ -36,7 +36,10 @@ def test_a_task_is_what_gymnasium_asks_and_continues_from_its_state(name):
     assert (observation != infos["final_obs"]).any(axis=1).all()
     other.reset(seed=9)
     np.testing.assert_array_equal(other.load_state_dict(many.state_dict()), observation)
-    for action in (0, 16, 5, 5, 8, 1, 2, 3, 4):
+    for k, action in enumerate((0, 16, 5, 5, 8, 1, 2, 3, 4)):
+        if k == 2:  # and from within an episode
+            other.reset(seed=9)
+            other.load_state_dict(many.state_dict())
         np.testing.assert_array_equal(many.step(np.full(3, action))[0], other.step(np.full(3, action))[0])
 
 
