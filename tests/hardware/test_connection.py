@@ -59,7 +59,7 @@ def at(sample_s: float, cycles: int, started: str = "2026-01-01 00:00:00") -> St
 CASES: dict[str, tuple[Steps, list[Act]]] = {
     "another unit at this position, and whatever stands there now is not ours": (
         [*read(state()), *read(state(DeviceID="garbled")), *read(state()), *(3 * read(state(DeviceID="other")))],
-        [READ, READ, (IdentityError, "pinned", "read"), (*UNSEEN, OFF[0])],
+        [READ, READ, (IdentityError, "1000200030004000", "read"), (*UNSEEN, OFF[0])],
     ),
     "an answer of an earlier time comes again, by its record or its count of cycles": (
         [*at(120.3, 3), *at(60.2, 3), *at(120.3, 2), *at(120.3, 3), *at(0.07, 1, "2026-01-02 00:00:00")],
