@@ -223,7 +223,7 @@ class Midpoint(InverseDynamics):
 class LearnedLawConfig(LawConfig):
     """The policy that sees no change before it comes."""
 
-    kind: str = setting("dqn", "which law of the composition")
+    kind: str = setting("dqn", "composition controller")
     control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
@@ -231,7 +231,7 @@ class LearnedLawConfig(LawConfig):
 class PreviewLawConfig(LearnedLawConfig):
     """The policy to which changes are announced."""
 
-    kind: str = setting("dqn_preview", "which law of the composition")
+    kind: str = setting("dqn_preview", "composition controller")
     control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
@@ -299,7 +299,7 @@ def _best(model: CocultureConfig, value: Array | None, estimate: ShareEstimate, 
 class RecedingConfig(LawConfig):
     """How far it plans."""
 
-    kind: str = setting("receding", "which law of the composition")
+    kind: str = setting("receding", "composition controller")
     control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
     horizon_min: float = setting(360.0, "how far ahead it plans", "min", within=(1, 1440))
 
@@ -330,7 +330,7 @@ class Receding(Periodic[RecedingConfig]):
 class OptimumConfig(LawConfig):
     """How often it decides."""
 
-    kind: str = setting("optimum", "which law of the composition")
+    kind: str = setting("optimum", "composition controller")
     control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
