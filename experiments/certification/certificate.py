@@ -39,6 +39,7 @@ class Stored:
     of: by name, fingerprints of the parts of a policy, and the other settings that affect the loop.
     safe: every requirement of safety is met. passed: every requirement is met. failed: the requirements that are not.
     setpoints: lowest and highest that it covers, OD. bounds: of an estimator's errors, and its growth shares.
+    cannot_hold: cases and setpoints that are not judged, because no pump rate of the policy holds the culture.
     """
 
     of: Mapping[str, Any]
@@ -48,6 +49,7 @@ class Stored:
     config: CertifyConfig
     setpoints: tuple[float, float]
     bounds: EstimateBounds | None
+    cannot_hold: tuple[str, ...]
 
     def differs(self, policy: Policy, settings: Mapping[str, Any]) -> list[str]:
         """List every part of a policy and every setting that differs from the certified one."""
@@ -120,6 +122,7 @@ def load(path: Path) -> Stored:
             build(CertifyConfig(), given["config"]),
             (float(low), float(high)),
             EstimateBounds.of(given["bounds"]) if given["bounds"] else None,
+            tuple(map(str, given["cannot_hold"])),
         )
     except (KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
@@ -192,7 +195,7 @@ def judged(
         return Opinion([f"its certificate {path} is damaged ({why}; {remedy})"])
     if reason := _unfit(stored, policy, settings, path, setpoints, remedy):
         return Opinion([reason], _short(stored.failed, stored))
-    if reason := _other_pump(policy, stored.config, bench, model):
+    if reason := _other_model(policy, stored.config, bench, model):
         return Opinion([reason], _short(stored.failed, stored))
     try:
         again = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
@@ -228,18 +231,22 @@ def _unfit(
     return ""
 
 
-def _other_pump(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> str:
-    """Return why a policy of the OD does not suit the pump of a run, with the remedy; "" where it does.
+def _other_model(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> str:
+    """Return why a policy of the OD does not suit the culture or the pump of a run, with the remedy; "" where it does.
 
-    A policy of the OD is proven for a tau within `uncertainty` of its training's; a policy of relative coordinates for
-    any.
+    It is proven for a tau and, so that nobody proves it for an easier culture, for a mu within `uncertainty` of its
+    training's; a policy of relative coordinates for any.
     """
     if policy.observation == RELATIVE:
         return ""
-    tau = model_of(policy, config).tau * bench.tau / config.bench.tau
+    proven, share = model_of(policy, config), 100.0 * config.uncertainty
+    mu = float(policy.metadata.get("model", {}).get("mu", proven.mu))
+    if not abs(proven.mu / mu - 1.0) <= config.uncertainty:
+        remedy = "train for this culture, or certify without env.mu"
+        return f"it is proven for mu = {proven.mu:.3g}, but trained for {mu:.3g} +- {share:.0f} % ({remedy})"
+    tau = proven.tau * bench.tau / config.bench.tau
     if abs(model.tau / tau - 1.0) <= config.uncertainty:
         return ""
-    share = 100.0 * config.uncertainty
     remedy = "give env_file=CALIBRATED.yaml of the calibration that it was trained on, or train for this pump"
     return f"it is proven for tau = {tau:.3g} +- {share:.0f} %, this run has tau = {model.tau:.3g} ({remedy})"
 
@@ -251,11 +258,13 @@ def _listed(checks: Sequence[Requirement]) -> str:
 
 
 def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
-    """Return missing performance, and performance limits that are wider than the default."""
+    """Return missing performance, wider limits of performance than the default, and cases that are not proven."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
     if laxer := stored.config.laxer_limits(safety=False):
         lines.append(f"its certificate sets wider limits of performance: {'; '.join(laxer)}")
+    if stored.bounds is None:  # docs/certificate.md has the growth shares that the pump holds for other policies
+        lines += [f"not proven: {case}; use a faster pump or less volume" for case in stored.cannot_hold]
     return lines
 
 

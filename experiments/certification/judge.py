@@ -97,8 +97,9 @@ class Certificate:
         for proof in self.proofs:
             for stretch in _runs(self.question.loop, ~proof.holdable):
                 found.setdefault(stretch, []).append(proof.case.name)
+        others = {1: "", 2: " and 1 other"}
         return [
-            f"{names[0]}{f' and {len(names) - 1} others' if names[1:] else ''}: from {self.question.what} "
+            f"{names[0]}{others.get(len(names), f' and {len(names) - 1} others')}: from {self.question.what} "
             f"{low:.4g} to {high:.4g} no pump rate holds the culture"
             for (low, high), names in found.items()
         ]

@@ -119,6 +119,20 @@ def test_a_device_refuses_a_policy_that_is_proven_for_another_pump(factor: float
     assert bool(other) == (not 0.7 <= factor <= 1.3)
 
 
+@pytest.mark.parametrize("mu", [0.0195, 0.0205, 0.022, 0.0385, 0.04])
+def test_a_device_refuses_a_policy_that_is_proven_for_another_culture_than_its_trainings(mu, tmp_path):
+    path = written(tmp_path / "policy.npz", laws.law(), config=replace(ASKED, env=EnvConfig(mu=mu)))
+    other = [reason for reason in concluded(laws.law(), path).refused if f"mu = {mu}" in reason]
+    assert bool(other) == (not 0.021 <= mu <= 0.039)
+
+
+def test_a_device_tells_the_cases_that_are_not_proven_since_the_pump_cannot_hold_them(tmp_path):
+    """At +-42 % growth needs (1.42)^2 of its nominal rate, more than the twice that the pump gives."""
+    found = proven(laws.law(), replace(ASKED, uncertainty=0.42))
+    given = written(tmp_path / "policy.npz", laws.law(), cannot_hold=found.cannot_hold())
+    assert any(found.cannot_hold()[0] in note for note in concluded(laws.law(), given).short)
+
+
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])
 def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_performance(share, tmp_path, monkeypatch):
     """Each requirement alone is written down as failed. Its number and limit are told, whatever follows."""

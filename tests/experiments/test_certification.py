@@ -466,7 +466,7 @@ def test_what_the_pump_cannot_hold_is_said_and_not_judged() -> None:
     certificate = proven(laws.law(), config=replace(FAST, uncertainty=0.42))
     assert certificate.passed
     assert certificate.cannot_hold() == [
-        "uncertain and 1 others: from setpoint 0.4 to 0.8 no pump rate holds the culture"
+        "uncertain and 1 other: from setpoint 0.4 to 0.8 no pump rate holds the culture"
     ]
     unheld = [proof.case.name for proof in certificate.proofs if not proof.holdable.any()]
     assert unheld == ["uncertain", "noise and uncertain"]
