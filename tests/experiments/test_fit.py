@@ -43,6 +43,8 @@ OF_TWO = Scenario((0.5,), (60.0,), (33.0,), ratios=(0.5,))
 def test_what_fits_is_taken(tmp_path: Path) -> None:
     for backend, scenario in ((PioreactorConfig(), WARMER), (RigBackendConfig(), CALM)):
         assemble.unpack(DeployConfig(backend=backend, scenario=scenario, force_policy=True), tmp_path)
+    undosed = PioreactorConfig(max_dose_ml=0.9)  # too little for a controller's doses, no reason not to watch
+    assemble.unpack(DeployConfig(backend=undosed, scenario=CALM, force_policy=True, watch=True), tmp_path)
 
 
 @pytest.mark.parametrize(
