@@ -1,5 +1,5 @@
 """Settings of every command: presets in YAML, and the declaration and check of config values.
 
-It needs neither Hydra nor numerical libraries and imports no other package of the project, so every package may import
-it.
+The package needs neither Hydra nor numerical libraries. It imports no other package of the project, so every package
+may import it.
 """

@@ -1,4 +1,4 @@
-"""The guests: what comes with the program and is no part of its core, which neither imports nor names it."""
+"""Guests: modules that come with the program outside its core. The core neither imports nor names them."""
 
 import importlib
 
@@ -8,10 +8,10 @@ GUESTS = {
     "experiments.record": ("experiments.coculture.aftermath",),
     "experiments.comparison": ("experiments.coculture.comparison",),
 }
-"""Room that is added to -> the modules that add what its guests bring (docs/extending.md)."""
+"""Package of the core -> modules that register the guests' parts in this package (docs/extending.md)."""
 
 
 def load(room: str) -> None:
-    """Make the guests of a room known, each once."""
+    """Import the guest modules of the package `room`; each module registers its parts once."""
     for name in GUESTS[room]:
         importlib.import_module(name)

@@ -1,10 +1,10 @@
-"""How errors, alarms and notices are declared: each one a class with a sentence, what helps, and its values by name.
+"""Declaration of errors, alarms and notices: each is a class with a sentence, a remedy and named values.
 
     class PumpStaysOn(DeviceStateError, says="{pump} is still on after {tries} tries", remedy="pull its plug"): ...
 
     raise PumpStaysOn(pump="Pump1", tries=4)
 
-The docstring says what it means, where the sentence does not. docs/three_am.md has a row for every such class.
+The docstring explains the message where the sentence does not. docs/three_am.md has a row for every such class.
 """
 
 from copy import copy
@@ -14,15 +14,15 @@ from typing import Any, ClassVar, Self
 
 
 def names(kind: "type[Message]") -> set[str]:
-    """Names of the values in a message's sentence and remedy."""
+    """Return the names of the values in a message's sentence and remedy."""
     return {name for _, name, _, _ in Formatter().parse(kind.says + kind.remedy) if name}
 
 
 class Message:
-    """Something to tell; where it declares no sentence, a text alone.
+    """Base class of errors, alarms and notices. A class without a declared sentence takes its text as argument.
 
-    Attributes: fields, its values; sentence, what happened; remedy, what to do; their names are `names`.
-    Raises: TypeError for a value that the sentence does not have, or one that is missing.
+    Attributes: fields: the values by name, exactly those of `names`. sentence: what happened. remedy: what to do.
+    Raises: TypeError if a value is missing, or if neither sentence nor remedy contains it.
     """
 
     says: ClassVar[str] = ""
@@ -41,7 +41,7 @@ class Message:
         return "; ".join(filter(None, (self.sentence, self.remedy)))
 
     def about(self, what: str) -> Self:
-        """Return the message with what it is about before its sentence."""
+        """Return a copy of the message whose sentence starts with `what` and a colon."""
         named = copy(self)
         named.sentence = f"{what}: {self.sentence}"
         return named
@@ -51,7 +51,7 @@ class Message:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Its name and values, for a row of a journal."""
+        """Class name and values of the message, for a row of the journal."""
         return {"name": type(self).__name__, "fields": {key: _plain(value) for key, value in self.fields.items()}}
 
 
@@ -64,7 +64,7 @@ def _plain(value: Any) -> Any:
 # fmt: off
 
 class NotAllowed(Message, ValueError, says="{key} = {given}: allowed {allowed}"):
-    """A value of a config or of a command line."""
+    """A value of a config or command line is invalid."""
 class NoSuchKey(Message, ValueError, says="{key}: no such key{hint}", remedy="allowed {where}: {known}"): ...
-class NameTaken(Message, ValueError, says="{what} {name}: there is one of this name already", remedy="choose another"):
-    """Told where something is added to those that come with the program."""
+class NameTaken(Message, ValueError, says="{what} {name}: this name is in use", remedy="choose another name"):
+    """An extension adds something under a name that the program already uses."""

@@ -1,4 +1,4 @@
-"""The presets of conf/ as plain values, without Hydra."""
+"""Presets of conf/ as plain values, read without Hydra."""
 
 import re
 from collections.abc import Mapping
@@ -17,21 +17,21 @@ ROOT = Path(str(resources.files("conf")))
 
 @dataclass(frozen=True)
 class Added:
-    """A preset that is not a file of conf/: its changes and a sentence that describes it."""
+    """Preset without a file in conf/. values: its changes to the config; what: a sentence that describes the preset."""
 
     values: dict[str, Any]
     what: str
 
 
 _added: dict[str, Added] = {}
-_placed: dict[str, Path] = {}  # command -> its file, if that is not in conf/
+_placed: dict[str, Path] = {}  # command -> its YAML file, if this file is not in conf/
 
 
 def add(name: str, values: Mapping[str, Any], what: str) -> None:
     """Add a preset for this process; replace an added preset of the same name.
 
-    Args: name: group and option, "controller/mine"; values, what: as of `Added`.
-    Raises: ValueError for an unknown group, or a preset that exists in conf/.
+    Args: name: group and option, "controller/mine"; values, what: as in `Added`.
+    Raises: ValueError if the group is unknown or conf/ has a preset of this name.
     """
     group, _, option = name.rpartition("/")
     known = _files()
@@ -48,7 +48,7 @@ def added() -> dict[str, Added]:
 
 
 def groups() -> dict[str, list[str]]:
-    """Config groups and their presets: {"env": ["sim"], ...}. Without Hydra's own groups."""
+    """Return the config groups and their presets, {"env": ["sim"], ...}, without Hydra's own groups."""
     found = _files()
     for name in _added:
         group, _, option = name.rpartition("/")
@@ -66,14 +66,14 @@ def _files() -> dict[str, list[str]]:
 
 
 def opening(name: str) -> list[str]:
-    """Return the comment at the top of a file of conf/, line by line."""
+    """Return the lines of the comment at the top of a file of conf/, without its `# @` lines."""
     lines = _file(name).read_text(encoding="utf-8").splitlines()
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
 
 
 def sentence(name: str) -> str:
-    """Describe a command or preset: the first sentence of the comment at the top of its file, without its name."""
+    """Return the first sentence of the comment at the top of a command's or preset's file, without its name."""
     if name in _added:
         return _added[name].what
     first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
@@ -81,7 +81,7 @@ def sentence(name: str) -> str:
 
 
 def place(path: Path) -> None:
-    """Register the command of a file that is beside its module. Args: path: NAME.yaml of this source tree."""
+    """Register a command whose config file NAME.yaml is beside its module, at `path`, and not in conf/."""
     _placed[path.stem] = path
 
 
@@ -90,7 +90,7 @@ def _file(name: str) -> Path:
 
 
 def program(command: str) -> str:
-    """Return the module that `python -m` runs."""
+    """Return the module that runs a command, for `python -m`."""
     path = _placed.get(command)
     parts = ("experiments", command) if path is None else path.relative_to(ROOT.parent).with_suffix("").parts
     return ".".join(parts)
@@ -102,7 +102,7 @@ def commands() -> list[str]:
 
 
 def chosen(command: str) -> dict[str, str | None]:
-    """Map each group that a command composes under its own name to its initial option."""
+    """Map each config group of a command to its default preset, and each group inside such a group to None."""
     root = yaml.safe_load(_file(command).read_text(encoding="utf-8")) or {}
     entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
     found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
@@ -110,7 +110,7 @@ def chosen(command: str) -> dict[str, str | None]:
 
 
 def owners(name: str) -> tuple[str, ...]:
-    """Return the commands of a recipe (line `# @command NAME,NAME`), or () for a preset of any command.
+    """Return the commands that accept a preset (its line `# @command NAME,NAME`); () means every command.
 
     Args: name: group and option, "experiment/paper".
     """
@@ -119,12 +119,12 @@ def owners(name: str) -> tuple[str, ...]:
 
 
 def companion(name: str) -> str | None:
-    """Return the preset of another group that belongs to this one, `agent=relative` (line `# @with ...`)."""
+    """Return the preset of another group to use with this preset, `agent=relative` (its line `# @with ...`)."""
     return _directive(name, "with")
 
 
 def _directive(name: str, word: str) -> str | None:
-    path = ROOT / f"{name}.yaml"  # none of null, of an added preset, or of a file of the user's own
+    path = ROOT / f"{name}.yaml"  # does not exist for null, an added preset or a user's file
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     found = re.search(rf"^# @{word} (\S+)$", text, re.MULTILINE)
     return found[1] if found else None
@@ -136,10 +136,10 @@ def options(command: str, group: str) -> list[str]:
 
 
 def load(name: str) -> dict[str, Any]:
-    """Load the changes of a preset, including those of the presets that it starts from.
+    """Load the changes of a preset, including those of the presets in its `defaults`.
 
     Args: name: group and option, "plant/bench".
-    Raises: ValueError with the presets of the group.
+    Raises: ValueError that lists the presets of the group if the option is unknown.
     """
     group, _, option = name.rpartition("/")
     known = groups().get(group, [])

@@ -18,7 +18,7 @@ from conf.messages import NoSuchKey, NotAllowed
 
 T = TypeVar("T")
 
-ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # for all parts (envs/bench.py)
+ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # keys of `bench` (envs/bench.py)
 TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
 
 
@@ -27,11 +27,11 @@ Kinds = Callable[[str, str], Any]
 
 @dataclass(frozen=True)
 class Meaning:
-    """Meaning of a field and its allowed values. Bounds of a tuple apply to each of its entries.
+    """Meaning of a config field and its allowed values. Bounds apply to each entry of a tuple.
 
-    interval: a pair [low, high], rising. some: a tuple that may not be empty. words: allowed in place of a number.
-    kinds: function of kind ("": not given) and key that returns the default config of a part, or of parts by name;
-    raises ValueError with the known kinds.
+    interval: the value is a pair [low, high], low <= high. some: a tuple needs an entry. words: allowed texts instead
+    of a number. note: text after the range in messages. kinds: function (kind, key) -> default config of a part of this
+    kind ("": no kind given), also for each part of a dict; it raises ValueError with the known kinds.
     """
 
     what: str
@@ -48,7 +48,7 @@ class Meaning:
     kinds: Kinds | None = None
 
     def holds(self, given: Any) -> bool:
-        """Return whether a value is in range; nan never is."""
+        """Return whether a value is allowed. A nan violates every bound."""
         if given is None or given in self.words:
             return True
         if isinstance(given, Sequence) and not isinstance(given, str):
@@ -65,9 +65,9 @@ class Meaning:
         )
 
     def allowed(self, key: str, many: bool = False, optional: bool = False) -> str:
-        """Describe the range in words, "" if every value of the type is allowed.
+        """Return the allowed range in words, "" if every value of the type is allowed.
 
-        Args: key: name of the field; many: it is a tuple; optional: it may be null.
+        Args: key: name of the field; many: whether the value is a tuple; optional: whether it may be null.
         """
         words = self._range((self.unit or "value") if many else key)
         if words and many and not self.interval:
@@ -98,7 +98,7 @@ class Meaning:
 
 @dataclass(frozen=True)
 class Entry:
-    """One field of a config: its name, its declaration (empty without `setting` or `part`), and its value."""
+    """One field of a config. said: its declaration, empty without `setting` or `part`; optional: it may be null."""
 
     name: str
     said: Meaning
@@ -107,7 +107,7 @@ class Entry:
 
     @property
     def allowed(self) -> str:
-        """The range in words."""
+        """Allowed range in words."""
         return self.said.allowed(self.name, isinstance(self.value, list | tuple), self.optional)
 
 
@@ -120,7 +120,7 @@ def entries(config: Any) -> list[Entry]:
 
 
 def setting(default: T, what: str, unit: str = "", within: tuple[float, float] | None = None, **bounds: Any) -> T:
-    """Declare a field of a config dataclass. Args: those of `Meaning`; within=(low, high) gives both bounds."""
+    """Declare a field of a config dataclass. Args: as in `Meaning`; within=(low, high) sets at_least and at_most."""
     if within:
         bounds |= {"at_least": within[0], "at_most": within[1]}
     said = {"meaning": Meaning(what, unit, **bounds)}
@@ -130,24 +130,24 @@ def setting(default: T, what: str, unit: str = "", within: tuple[float, float] |
 
 
 def part(factory: Callable[[], T], what: str, kinds: Kinds | None = None) -> T:
-    """Declare a field that holds a config dataclass of its own; kinds: as of `Meaning`."""
+    """Declare a field that holds another config dataclass. Args: kinds: as in `Meaning`."""
     return field(default_factory=factory, metadata={"meaning": Meaning(what, kinds=kinds)})
 
 
 def add(to: type[Any], more: type[Any]) -> None:
-    """Give a config class further fields, behind its own; they are set, compared, checked and shown as its own are.
+    """Append fields to a config class. They are set, compared, checked and shown like the fields it already has.
 
-    Args: more: a class with the fields, declared as in a config but for the decorator. Its `__post_init__` gets the
-      instances of `to`, before their own.
-    Raises: ValueError for a field that is there already.
+    Args: more: class that declares the fields like a config, without the decorator. Its `__post_init__` runs on each
+      new instance of `to`, before the `__post_init__` of `to`.
+    Raises: ValueError if `to` already has a field of this name.
     """
     own, hints = {f.name: f for f in fields(to)}, get_type_hints(more)
     added = {name: vars(more)[name] for name in more.__annotations__}
     for name, declared in added.items():
-        require(name not in own, f"a field of {to.__name__}", name, "a name of its own")
+        require(name not in own, f"new field of {to.__name__}", name, "a name that the class does not have yet")
         to.__annotations__[name] = hints[name]
         made = declared.default_factory() if declared.default is MISSING else declared.default
-        setattr(to, name, made)  # of an instance that was made before
+        setattr(to, name, made)  # for instances made before
     checks = [getattr(of, "__post_init__", None) for of in (more, to)]
 
     def checked(self: Any) -> None:
@@ -168,7 +168,7 @@ def _said(f: Any) -> dict[str, Any]:
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
-    """Check a rule, e.g. for several fields together. Raises: NotAllowed."""
+    """Check a rule, e.g. a rule about several fields. Raises: NotAllowed if `holds` is false."""
     if not holds:
         raise NotAllowed(key=key, given=list(given) if isinstance(given, tuple) else given, allowed=allowed)
 
@@ -186,28 +186,27 @@ def check(config: Any, prefix: str = "") -> None:
 
 
 def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
-    """Build a config dataclass with some of its values replaced; parts are given as nested mappings.
+    """Return a copy of the config `default` in which `values` replace its values.
 
-    Numbers may be text and tuples may be lists, as in YAML and command lines.
+    Parts are given as nested mappings. Numbers may be text and tuples may be lists, as in YAML and command lines.
 
-    Args:
-      default: an instance with the values that `values` does not contain.
-      prefix: key of the config, for messages.
-    Raises: ValueError with an unknown key and the most similar key, or with key, value and allowed values.
+    Args: prefix: key of the config, for messages.
+    Raises:
+      ValueError: for an unknown key, with the most similar key; for an invalid value, with the allowed values.
     """
     try:
         return _built(default, values, prefix)
     except _NoSuchKey as error:
         key, of = error.args
         above, _, name = key.rpartition(".")
-        moved = "; it is said under bench" if name in ON_BENCH else ""
+        moved = "; set it under bench" if name in ON_BENCH else ""
         meant = "" if moved else _meant(name, default, prefix)
         where = f"under {above}" if above else "here"
         raise NoSuchKey(key=key, hint=f"{moved}{meant}", where=where, known=", ".join(of)) from None
 
 
 class _NoSuchKey(Exception):
-    """Unknown key, with the whole key and the known names."""
+    """Unknown key. args: the whole key and the list of known names."""
 
 
 def _keys(config: Any, prefix: str) -> Iterator[str]:
@@ -245,7 +244,7 @@ def _built(default: T, values: Mapping[str, Any], prefix: str) -> T:
 
 
 def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> Any:
-    """Convert a plain value to the type of its field. Args: said: of the field. Raises: ValueError naming the key."""
+    """Convert a plain value to the type of its field, declared in `said`. Raises: ValueError that names the key."""
     if get_origin(hint) in (Union, types.UnionType):
         if given is None:
             return None

@@ -1,5 +1,5 @@
-"""A DQN from scratch that learns from any vector environment; of this project it imports only `conf`.
+"""DQN from scratch that learns from any vector environment. Of this project the package imports only `conf`.
 
-Files to read for one update, in order: trainer.py, agent.py, replay.py, targets.py (and network.py for the arithmetic).
+To follow one update, read trainer.py, agent.py, replay.py and targets.py in this order; network.py has the arithmetic.
 This file imports nothing, so that `dqn.policy` loads without torch.
 """

@@ -1,4 +1,4 @@
-"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once (S = 1: one agent)."""
+"""The agent: epsilon-greedy choice of actions and the DQN update, for S independent seeds at once."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -25,15 +25,15 @@ class DQNAgent:
     """Deep Q-learning (Mnih 2015) of S independent agents.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
-    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. The updates of
-    one step draw from the same memory, and between two copies the target network stays, so their minibatches and
-    targets are computed together. `hindsight_share` changes the minibatch, `action_gap` and `value_root` the target y,
-    `huber` the loss.
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. All updates of
+    one environment step draw from the same memory, and the target network is constant between two copies. So the
+    minibatches and targets of these updates are computed together. `hindsight_share` changes the minibatch,
+    `action_gap` and `value_root` change the target y, and `huber` changes the loss.
 
     Args:
-      config: hyper-parameters. observations: O, numbers per observation. actions: A.
+      config: hyper-parameters. observations: O, numbers per observation. actions: A, number of actions.
       streams: for each name in STREAMS one SeedSequence per agent.
-      relabel: goal replacement for a fraction `config.hindsight_share` of each minibatch.
+      relabel: replaces the goals in a fraction `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
     """
 
@@ -68,7 +68,7 @@ class DQNAgent:
         self._relabelled = round(config.hindsight_share * config.batch_size)
         if self._relabelled and relabel is None:
             raise ValueError(
-                f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
+                f"agent.hindsight_share = {config.hindsight_share}: the task has no goal to replace; set the share to 0"
             )
         self._relabel = relabel
         numbers = self._relabelled * relabel.numbers if relabel else 0
@@ -79,7 +79,7 @@ class DQNAgent:
         }  # fmt: skip
         self.steps = 0  # environment steps taken
         self.updates = 0
-        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
+        self.loss = torch.zeros(self.n_agents, device=self.device)  # at the last diagnosed update
         self.q_range = torch.zeros(self.n_agents, 2, device=self.device)  # min and max Q in its minibatch
 
     @property
@@ -87,7 +87,7 @@ class DQNAgent:
         return self.config.epsilon(self.steps)
 
     def act(self, observation: Array) -> NDArray[np.int64]:
-        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
+        """Choose an epsilon-greedy action for the observation of each agent, (S, O) -> (S,)."""
         u: NDArray[np.float64] = self._explore.take(1)[:, 0]
         action = (u[:, 1] * self.n_actions).astype(np.int64)
         greedy = u[:, 0] >= self.epsilon
@@ -100,9 +100,9 @@ class DQNAgent:
     def observe(
         self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array, ended: Array | None = None
     ) -> None:
-        """Store one step of every agent (arguments as `Replay.add`) and do the due updates.
+        """Store one step of every agent and run the updates that are due.
 
-        Args: ended: not used, because transitions are replayed separately.
+        Args: as in `Replay.add`; ended: not used, because transitions are replayed separately.
         """
         self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
@@ -110,15 +110,15 @@ class DQNAgent:
             self.learn(self.config.updates_per_step)
 
     def _drawn(self, uniform: Array) -> torch.Tensor:
-        """Pass random numbers through the relabelling, block by block: (S, calls, W m) -> (S, calls, m, any)."""
+        """Turn a block of random numbers into goals: (S, calls, m W) -> (S, calls, m, any)."""
         assert self._relabel is not None
         numbers = torch.from_numpy(uniform).to(self.device)
         return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, self._relabel.numbers))
 
     def _minibatches(self, most: int) -> Transition:
-        """Draw n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with a new goal.
+        """Draw n <= `most` minibatches of B transitions per agent, (S, n, B); part of each minibatch gets new goals.
 
-        Their observations are the network's features already, (S, n, B, F): the map is the same for every update.
+        The observations are returned as features of the network, (S, n, B, F), because their map never changes.
         """
         batch = self.replay.sample(self._draws.take(most))
         if self._relabelled:
@@ -130,7 +130,7 @@ class DQNAgent:
         return batch._replace(s_tm1=features(batch.s_tm1), s_t=features(batch.s_t))
 
     def _q_target(self, features: torch.Tensor) -> torch.Tensor:
-        """Q of the target network, (S, n, B, F) -> (S, n, B, A)."""
+        """Compute Q with the target network, (S, n, B, F) -> (S, n, B, A)."""
         agents, n, b, f = features.shape
         return self.target.forward(features.view(agents, n * b, f))[0].view(agents, n, b, self.n_actions)
 
@@ -158,9 +158,9 @@ class DQNAgent:
             updates -= target.shape[1]
 
     def fit(self, features: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
-        """Take one Adam step towards Q(features, action) = target, then copy and diagnose if due.
+        """Take one Adam step towards Q(features, action) = target; if due, copy to the target network and diagnose.
 
-        Args: features: of the observations, (S, B, F). action: (S, B) int64. target: (S, B).
+        Args: features: features of the observations, (S, B, F). action: (S, B) int64. target: (S, B).
         """
         c = self.config
         q, inputs = self.network.forward(features)
@@ -175,7 +175,7 @@ class DQNAgent:
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def curves(self) -> dict[str, NDArray[np.float64] | float]:
-        """Return the exploration rate, and loss and range of Q of the last diagnosed update."""
+        """Return the exploration rate now, and the loss and range of Q at the last diagnosed update."""
         q_range = self.q_range.cpu().numpy().astype(np.float64)
         return {
             "train/loss": self.loss.cpu().numpy().astype(np.float64),
@@ -185,7 +185,7 @@ class DQNAgent:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the complete learning state. A new agent of the same config continues bit for bit on one processor."""
+        """Return the complete learning state; with it, a new agent continues bit for bit on the same processor."""
         tensors = {"online": self.network.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
         counts = {"steps": self.steps, "updates": self.updates}
         parts = {name: part.state_dict() for name, part in self._parts.items()}

@@ -14,9 +14,9 @@ class CheckpointError(Exception):
 
 
 def save(path: Path, state: dict[str, Any]) -> None:
-    """Write tensors and plain Python values atomically: `path` is always complete, also after kill -9.
+    """Write tensors and plain Python values atomically: the file at `path` is always complete, even after kill -9.
 
-    Raises: OSError if the disk fails; the previous checkpoint stays.
+    Raises: OSError if the disk fails; the previous checkpoint is kept.
     """
     temporary = path.with_suffix(path.suffix + ".part")
     with open(temporary, "wb") as f:
@@ -32,7 +32,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint; only tensors and plain values are accepted.
+    """Read a checkpoint. The file may contain only tensors and plain values.
 
     Raises: CheckpointError with file and remedy.
     """
@@ -40,17 +40,17 @@ def load(path: Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CheckpointError(
-            f"{path}: no such checkpoint; the run ended before its first one, start it anew"
+            f"{path}: no such checkpoint, because the run ended before its first one; start a new run"
         ) from None
     except Exception as error:  # torch's unpickler raises various errors
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
-            f"{path}: not a readable checkpoint ({reason}); use one written by this project"
+            f"{path}: not a readable checkpoint ({reason}); use a checkpoint written by this program"
         ) from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(
             f"{path}: checkpoint format {content.get('format') if isinstance(content, dict) else '?'}: "
-            f"allowed {FORMAT}; train anew with this version"
+            f"allowed {FORMAT}; start a new training with this version"
         )
     state: dict[str, Any] = content["state"]
     return state

@@ -1,4 +1,4 @@
-"""Hyper-parameters of the agent; free of torch, so that a command line can be checked without loading it."""
+"""Hyper-parameters of the agent. This module does not import torch, so a command line is checked fast."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from conf.schema import check, setting
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """All settings of learning; the defaults are a plain DQN, conf/agent/*.yaml have other values and reasons.
+    """All settings of learning. The defaults give a plain DQN; conf/agent/*.yaml have other values and their reasons.
 
     Steps are control steps of one environment; updates are gradient steps.
     Raises: ValueError with key, value and allowed range.
@@ -18,15 +18,15 @@ class DQNConfig:
     gamma: float = setting(0.99, "discount factor per step", at_least=0.0, below=1.0)
     learning_rate: float = setting(1e-3, "learning rate of Adam", above=0.0, at_most=1.0)
     learning_rate_end: float | None = setting(
-        None, "final rate, reached in the second half of the updates; null: constant", above=0.0, at_most=1.0
+        None, "final rate: falls to it in the second half of the updates; null: constant", above=0.0, at_most=1.0
     )
     total_steps: int = setting(10_000, "length of training", "steps", at_least=1)
     epsilon_start: float = setting(1.0, "exploration rate at step 0", within=(0, 1))
     epsilon_end: float = setting(0.05, "exploration rate from step epsilon_steps on", within=(0, 1))
-    epsilon_steps: int = setting(5_000, "steps over which the exploration rate falls linearly", "steps", at_least=0)
+    epsilon_steps: int = setting(5_000, "steps over which the exploration rate changes linearly", "steps", at_least=0)
     replay_size: int = setting(10_000, "size of the replay memory", "transitions", at_least=1)
     learn_start: int = setting(
-        500, "steps before the first update", "steps", at_least=1, note="there must be something to replay"
+        500, "steps before the first update", "steps", at_least=1, note="the replay memory must not be empty"
     )
     batch_size: int = setting(64, "transitions in a minibatch", "transitions", at_least=1)
     updates_per_step: int = setting(1, "gradient steps per control step", "updates", at_least=1)
@@ -42,21 +42,21 @@ class DQNConfig:
     output_basis_decay: float = setting(
         0.0, "decay of the output basis, whose rows scale as (1 + degree)^-decay; 0: no basis", at_least=0.0
     )
-    huber: float = setting(0.0, "TD error above which the gradient is clipped; 0: squared error", at_least=0.0)
+    huber: float = setting(0.0, "TD error, +-, beyond which the gradient is clipped; 0: no clipping", at_least=0.0)
     value_root: float = setting(
         0.0,
-        "c of h(z) = c - sqrt(c^2 - z), the scale on which the network learns values z; 0: values themselves",
+        "c in h(z) = c - sqrt(c^2 - z), which the network learns instead of the value z; 0: the value itself",
         at_least=0.0,
     )
-    reward_scale: float = setting(1.0, "factor of the rewards inside the agent", above=0.0)
-    hindsight_share: float = setting(0.0, "fraction of each minibatch that gets another goal", within=(0, 1))
-    hindsight_near: float = setting(0.0, "fraction of these with a goal close to the reached state", within=(0, 1))
+    reward_scale: float = setting(1.0, "factor by which the agent multiplies the rewards", above=0.0)
+    hindsight_share: float = setting(0.0, "fraction of each minibatch whose goals are replaced", within=(0, 1))
+    hindsight_near: float = setting(0.0, "fraction of these goals that are close to the reached state", within=(0, 1))
     hindsight_width: tuple[float, float] = setting(
-        (1e-3, 0.8), "range of that distance, drawn log-uniformly", "OD", above=0.0, interval=True
+        (1e-3, 0.8), "distance of a close goal from the state, log-uniform", "OD", above=0.0, interval=True
     )
     input_matrix: tuple[float, ...] = setting((), "M of the features M observation + c, row by row; []: identity")
-    input_offset: tuple[float, ...] = setting((), "c, one number per feature")
-    init_zero_output: bool = setting(False, "start the last layer at zero")
+    input_offset: tuple[float, ...] = setting((), "c of the features M observation + c, one number per feature")
+    init_zero_output: bool = setting(False, "initialise the last layer with zeros")
 
     def __post_init__(self) -> None:
         check(self, "agent")
@@ -69,13 +69,13 @@ class DQNConfig:
             )
 
     def epsilon(self, step: int) -> float:
-        """Probability of a random action at an environment step: linear in the step, then constant."""
+        """Return the probability of a random action at an environment step: first linear in the step, then constant."""
         if step >= self.epsilon_steps:
             return self.epsilon_end
         return self.epsilon_start + (self.epsilon_end - self.epsilon_start) * step / self.epsilon_steps
 
     def learning_rate_at(self, update: int) -> float:
-        """Adam's rate at a gradient step."""
+        """Return Adam's learning rate at a gradient step."""
         if self.learning_rate_end is None:
             return self.learning_rate
         part = max(0.0, 2.0 * update / max(1, self.total_updates) - 1.0)

@@ -1,4 +1,4 @@
-"""Hindsight: a replayed transition (x, u, x') does not depend on the goal, so it is valid with any goal."""
+"""Hindsight: replace the goals of replayed transitions. A transition (x, u, x') is valid with every goal."""
 
 import math
 from collections.abc import Callable
@@ -11,31 +11,31 @@ from dqn.replay import Transition
 
 
 class Relabel(Protocol):
-    """New goals for the transitions of a minibatch, in two steps; the first needs only random numbers.
+    """Replacement of the goals in a minibatch, in two steps; the first step needs only random numbers.
 
-    numbers: W, uniform numbers per transition.
+    numbers: W, the random numbers needed per transition.
     """
 
     numbers: int
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Turn uniform random numbers into goals, (..., B, W) -> (..., B, any), for many minibatches at once."""
+        """Turn uniform random numbers into goals, for many minibatches at once, (..., B, W) -> (..., B, any)."""
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """Set the drawn goals, (..., B, any), in transitions (..., B), in place."""
+        """Write the drawn goals, (..., B, any), and the new rewards into transitions (..., B), in place."""
 
 
 class GoalRelabel:
     """Replacement of goal and reward of transitions (Andrychowicz 2017); observations are [x, goal].
 
-    Two kinds of goals are drawn. A fraction `hindsight_near` of each batch gets x' + d or x' - d, log d uniform over
-    the range `hindsight_width`, so that errors of every order of magnitude are trained on equally often. If one side
-    lies outside the range of goals, the other side is taken. The rest of the batch, and transitions for which both
-    sides lie outside, get a goal drawn uniformly from the range of goals.
+    Two kinds of goals are drawn. A fraction `hindsight_near` of each batch gets the goal x' + d or x' - d. log d is
+    uniform over the range `hindsight_width`, so errors of every order of magnitude are trained on equally often. If one
+    of these goals lies outside the range of goals, the other is taken. The rest of the batch, and transitions for which
+    both lie outside, get a goal drawn uniformly from the range of goals.
 
     Args:
-      config: its keys `hindsight_*`. goals: lowest and highest goal of the task.
-      reward: (x', goal) -> reward, all of one shape.
+      config: uses the keys `hindsight_*`. goals: lowest and highest goal of the task.
+      reward: function (x', goal) -> reward; all three have the same shape.
     """
 
     numbers = 2
@@ -50,12 +50,12 @@ class GoalRelabel:
         self._config, self._reward = config, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Draw a goal from the whole range, and d with its sign, infinite where the goal may be anywhere."""
+        """Draw a goal from the whole range, and d with its sign; d is infinite for the rest of the batch."""
         goal = self._low + (self._high - self._low) * uniform[..., 0]
         return torch.stack([goal, _distance(self._config, uniform[..., 1])], dim=-1)
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """Goals and rewards of a batch, in place."""
+        """Replace goals and rewards of a batch, in place."""
         x = batch.s_t[..., 0]
         goal, distance = drawn.unbind(-1)
         for candidate in (x - distance, x + distance):
@@ -66,12 +66,12 @@ class GoalRelabel:
 
 
 class ShiftRelabel:
-    """The same for observations [error, parameter]: a new goal shifts the error before and after equally.
+    """Goal replacement for observations [error, parameter]: a new goal shifts both errors of a step equally.
 
-    A fraction `hindsight_near` of each batch is shifted so that the error after the step is d or -d, as above. The
-    others are shifted so that the error before the step is uniform within +-span.
+    A fraction `hindsight_near` of each batch is shifted so that the error after the step is d or -d, with d drawn as in
+    `GoalRelabel`. The others are shifted so that the error before the step is uniform within +-span.
 
-    Args: config: its keys `hindsight_*`. span: of errors. reward: of the error reached, any shape.
+    Args: config: uses the keys `hindsight_*`. span: largest error. reward: function of the reached error, any shape.
     """
 
     numbers = 2
@@ -80,12 +80,12 @@ class ShiftRelabel:
         self._config, self._span, self._reward = config, span, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Draw an error before the step from the whole range, and d with its sign, infinite for any distance."""
+        """Draw an error before the step within +-span, and d with its sign; d is infinite for the rest of the batch."""
         error = self._span * (2.0 * uniform[..., 0] - 1.0)
         return torch.stack([error, _distance(self._config, uniform[..., 1])], dim=-1)
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """Errors and rewards of a batch, in place."""
+        """Replace errors and rewards of a batch, in place."""
         error, distance = drawn.unbind(-1)
         before, after = batch.s_tm1[..., 0], batch.s_t[..., 0]
         shift = torch.where(distance.isfinite(), distance - after, error - before).to(after.dtype)
@@ -95,17 +95,17 @@ class ShiftRelabel:
 
 
 class ProgramRelabel:
-    """The same for observations [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
+    """Goal replacement for observations [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
 
-    x is an integrator: what a step adds to it (or multiplies it by) depends on neither x nor the goals. So x before and
-    after is moved to a uniformly drawn place, and a setpoint is drawn as above, near the reached x or anywhere. With an
-    announced change, the next setpoint is drawn anywhere and its time uniformly from the periods of the preview; for a
-    fraction `unannounced` nothing is announced. After the step the change is one period closer, or has happened.
+    x is an integrator: the change of x in a step (a sum or a factor) depends on neither x nor the goals. So the reached
+    x is drawn anew, and the setpoint is drawn as in `GoalRelabel`, near this x or anywhere. With a preview, the next
+    setpoint is drawn anywhere, and its time is uniform over the periods of the preview; a fraction `unannounced` has no
+    announcement. After the step the change is one period closer or has happened.
 
     Args:
-      config: its keys `hindsight_*`. place: uniform numbers to x. spread: to setpoints as x. reward: (x', setpoint) ->
-      reward. column: of the setpoint. period, preview: of a decision and of the announcement, in units of the time
-      column; preview 0: there are no such columns. scales: a step multiplies x.
+      config: uses the keys `hindsight_*`. place, spread: map uniform numbers to x, to setpoints. reward: function (x',
+      setpoint) -> reward. column: index of the setpoint. period: duration of a step. preview: how long ahead a change
+      is known, 0: no such columns; both in the unit of the time column. scales: whether a step multiplies x.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class ProgramRelabel:
         self.numbers = 5 if preview else 3
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Draw x after the step, a setpoint, its distance from x (infinite: anywhere), next setpoint, its time."""
+        """Draw x after the step, setpoint, its distance from x (infinite: anywhere), next setpoint and its time."""
         parts = [self._place(uniform[..., 0]), self._spread(uniform[..., 1]), _distance(self._config, uniform[..., 2])]
         if self._preview:
             known = ((uniform[..., 4] - self._unannounced) / (1.0 - self._unannounced)).clamp(min=-1e-9)
@@ -134,7 +134,7 @@ class ProgramRelabel:
         return torch.stack(parts, dim=-1)
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """x, setpoints, times and rewards of a batch, in place."""
+        """Replace x, setpoints, times and rewards of a batch, in place."""
         x, setpoint, distance, *announced = drawn.to(batch.s_t.dtype).unbind(-1)
         before, after = batch.s_tm1[..., 0], batch.s_t[..., 0]
         batch.s_tm1[..., 0] = before * (x / after) if self._scales else before + (x - after)
@@ -154,9 +154,9 @@ class ProgramRelabel:
 
 
 def _distance(config: DQNConfig, uniform: torch.Tensor) -> torch.Tensor:
-    """Signed distances whose logarithm is uniform over `hindsight_width`; infinite beyond the share `hindsight_near`.
+    """Draw signed distances, log-uniform over `hindsight_width`, for a fraction `hindsight_near`; else infinite.
 
-    One number holds both the side and the distance. Args: uniform: (..., B). Returns: the same shape.
+    One random number gives both sign and distance. Args: uniform: (..., B). Returns: the same shape.
     """
     smallest, largest = (math.log(width) for width in config.hindsight_width)
     side = torch.where(uniform < 0.5, -1.0, 1.0)

@@ -16,12 +16,12 @@ Layer = tuple[torch.Tensor, torch.Tensor]
 
 
 def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence, zero_output: bool = False) -> np.ndarray:
-    """Weights of one network, flat: W and b of each layer uniform in +-1/sqrt(inputs) (the default of torch.nn.Linear).
+    """Draw the weights of one network: W and b of each layer uniform in +-1/sqrt(inputs), as in torch.nn.Linear.
 
     Args:
-      sizes: units of feature, hidden and output layers. seed: the agent's own stream.
-      zero_output: the last layer starts at 0, and with it every Q value.
-    Returns: float32, shape (P,), laid out as `QNetwork` wants it.
+      sizes: number of features, of units in each hidden layer, and of outputs. seed: random stream of the agent.
+      zero_output: whether the last layer, and so every Q value, starts at 0.
+    Returns: float32, shape (P,), in the order that `QNetwork` needs.
     """
     rng = np.random.default_rng(seed)
     parts = []
@@ -36,13 +36,13 @@ def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence, zero_out
 
 
 def action_basis(actions: int, decay: float) -> torch.Tensor:
-    """C with Q = z C: row k is the polynomial of degree k in the action, scaled by (1 + k)^-decay.
+    """Return C, with Q = z C for the outputs z: row k is (1 + k)^-decay times the polynomial of degree k in the action.
 
     The polynomials are orthogonal on the A equidistant actions and have mean square 1 there (discrete Legendre or Gram
     polynomials). C is invertible, so the network can represent the same Q values. C changes the direction of gradient
-    steps: a step for one action moves Q of similar actions equally, and differences of higher degree between actions
-    are learned more slowly. Q is nearly a parabola in the pump rate, which three rows give exactly. A cosine series
-    would flatten the parabola at the ends of the grid.
+    steps: a step for one action moves Q of similar actions about equally, and differences of higher degree between
+    actions are learned more slowly. Q is nearly a parabola in the pump rate, which three rows represent exactly. A
+    cosine series would flatten the parabola at the ends of the grid.
 
     Args: actions: A. decay: >= 0.
     Returns: shape (A, A), float32.
@@ -57,19 +57,19 @@ def action_basis(actions: int, decay: float) -> torch.Tensor:
 class QNetwork:
     """Q(observation, .) = W3 relu(W2 relu(W1 f + b1) + b2) + b3 with f = M observation + c, for S agents at once.
 
-    M and c are constants, exported with the weights. All weights of all agents live in one tensor `flat`, shape (S, P),
-    and the layers are views of it, so that a step of the optimiser or a copy is one operation. Gradients are written
-    out by hand: two matrix products a layer, no graph.
+    M and c are constants, exported with the weights. All weights of all agents are in one tensor `flat`, shape (S, P),
+    and the layers are views of this tensor. So an optimiser step or a copy is one operation. The gradients are coded by
+    hand: two matrix products per layer, no graph.
 
-    Memory order differs from shape in the last layer: its weights lie as (outputs, inputs) and Q as (S, A, B). Matrix
+    The last layer is transposed in memory: its weights are stored as (outputs, inputs) and Q as (S, A, B). Matrix
     products and reductions are faster with a long innermost axis, and there are more transitions than actions.
 
     Args:
-      flat: weights, shape (S, P), laid out as by `initial_weights`.
-      sizes: units of feature, hidden and output layers.
-      matrix: M, shape (features, observations); None means that the features are the observation.
+      flat: weights, shape (S, P), in the order of `initial_weights`.
+      sizes: number of features, of units in each hidden layer, and of outputs.
+      matrix: M, shape (features, observations); None: the features are the observation.
       offset: c, shape (features,).
-      basis: C of `action_basis`, by which the outputs are multiplied; None means that they are the Q values.
+      basis: C of `action_basis`, which multiplies the outputs; None: the outputs are the Q values.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class QNetwork:
         self._mix = None if basis is None else basis.T.expand(flat.shape[0], -1, -1)  # C^T for every agent
 
     def _views(self, flat: torch.Tensor) -> list[Layer]:
-        """(W, b) of each layer as views: W (S, in, out), b (S, 1, out)."""
+        """Return (W, b) of each layer as views of `flat`: W (S, in, out), b (S, 1, out)."""
         views = []
         start = 0
         for i, o in pairwise(self.sizes):
@@ -116,15 +116,15 @@ class QNetwork:
         return observation
 
     def input_map(self) -> tuple[np.ndarray, np.ndarray]:
-        """M (F, O) and c (F,) as NumPy arrays."""
+        """Return M (F, O) and c (F,) as NumPy arrays."""
         return self._matrix.cpu().numpy().copy(), self._offset.cpu().numpy().copy()
 
     def output_map(self) -> np.ndarray:
-        """C (A, A) as a NumPy array."""
+        """Return C (A, A) as a NumPy array."""
         return np.eye(self.sizes[-1], dtype=np.float32) if self._basis is None else self._basis.cpu().numpy().copy()
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Q values, shape (S, B, A), of features (S, B, F), and the inputs of each layer, for `backward`."""
+        """Compute Q values, (S, B, A), from features (S, B, F); also return the inputs of each layer for `backward`."""
         h = features
         inputs = [h]
         for weight, bias in self.layers[:-1]:
@@ -137,11 +137,11 @@ class QNetwork:
         return q.transpose(1, 2), inputs
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
-        """Q values only; observation (S, B, observations) -> (S, B, A)."""
+        """Compute the Q values only; observation (S, B, observations) -> (S, B, A)."""
         return self.forward(self.features(observation))[0]
 
     def backward(self, inputs: list[torch.Tensor], grad_q: torch.Tensor) -> None:
-        """Fill `grad` with the gradient of a loss whose derivative by Q is `grad_q`, shape (S, B, A)."""
+        """Write the gradient of a loss into `grad`, given the loss's derivative by Q, `grad_q`, shape (S, B, A)."""
         delta = grad_q if self._mix is None else torch.bmm(grad_q, self._mix)
         torch.bmm(delta.transpose(1, 2), inputs[-1], out=self._grad_last)
         torch.sum(delta, 1, keepdim=True, out=self._grads[-1][1])
@@ -161,12 +161,12 @@ def export(
     limits: tuple[NDArray[np.float64], NDArray[np.float64]],
     metadata: dict[str, Any],
 ) -> Policy:
-    """Export the greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
+    """Export the greedy policy of one agent; the basis C is multiplied into the last layer.
 
     Args:
-      network: source of layer sizes and input map. agent: index into `flat`.
-      flat: weights of all agents, shape (S, P); e.g. the best ones, not those of `network`.
-      actions: the action grid, shape (A,). limits: of the observation, low and high, each (O,).
+      network: source of layer sizes, input map and basis. agent: index into `flat`.
+      flat: weights of all agents, shape (S, P); e.g. the best weights instead of those in `network`.
+      actions: the action grid, shape (A,). limits: lowest and highest observation, each (O,).
       metadata: observation, model, config_hash and other values to check or show.
     """
     own = QNetwork(flat[agent : agent + 1].detach().cpu().clone(), network.sizes)

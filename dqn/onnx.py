@@ -1,4 +1,4 @@
-"""From `dqn.policy.Policy` to an ONNX file: Gemm and Relu, and the limits of the observation before them."""
+"""Export of a `dqn.policy.Policy` to an ONNX file: the observation is clipped, then Gemm and Relu layers follow."""
 
 import json
 from pathlib import Path
@@ -11,9 +11,9 @@ from dqn.policy import Policy
 
 
 def write(policy: Policy, path: Path) -> None:
-    """Write the network, (N, O) float32 `observation` -> (N, A) float32 `q`; the greedy action is its argmax.
+    """Write the network, (N, O) float32 `observation` -> (N, A) float32 `q`; the greedy action is the argmax of `q`.
 
-    The file's metadata hold the names of the observation and the values of the actions. Raises: OSError.
+    The file's metadata contain the names of the observations and the values of the actions. Raises: OSError.
     """
     floats = {"low": policy.low, "high": policy.high, "w": policy.input_matrix.T, "b": policy.input_offset}
     floats |= {f"w{k}": weight for k, weight in enumerate(policy.weights)}

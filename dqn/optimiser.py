@@ -7,13 +7,13 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 
 
 class Adam:
-    """w <- w - lr m^ / (sqrt(v^) + eps), m and v running means of g and g^2, ^ corrected for their start (Kingma 2015).
+    """Adam, w <- w - lr m^ / (sqrt(v^) + eps); m^ and v^ are bias-corrected running means of g and g^2 (Kingma 2015).
 
-    The step is the fused kernel of torch.optim.Adam(fused=True). Torch's class also manages parameter groups and takes
-    six times as long. For one agent, the direct call saves a tenth of an update.
+    A step calls the fused kernel of torch.optim.Adam(fused=True) directly. Torch's class also manages parameter groups
+    and takes six times as long; for one agent, the direct call shortens an update by a tenth.
 
     Args:
-      weights: changed in place, any shape. gradient: read at each step, same shape.
+      weights: changed in place by each step, any shape. gradient: read at each step, same shape.
     """
 
     def __init__(self, weights: torch.Tensor, gradient: torch.Tensor) -> None:

@@ -7,9 +7,9 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `obs
 | observation | what it is | actions |
 |---|---|---|
 | od, setpoint (, next_setpoint, minutes_to_change) | OD x, setpoint r, and its change (envs/preview.py) | mL/s |
-| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | parts of it |
+| error, growth_share | e = ln(x/r)/B, s = mu h/B; B: fall of ln x in one period h of full pump | share of full pump |
 
-`add` makes other observations known.
+`add` registers other observations.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = 2
-LARGEST = 1e6  # of a weight: below it, no value overflows, and none that underflows matters, in single precision
+LARGEST = 1e6  # largest allowed weight: up to it no value overflows single precision, and underflow is harmless
 ABSOLUTE = ("od", "setpoint")
 PREVIEW = (*ABSOLUTE, "next_setpoint", "minutes_to_change")
 RELATIVE = ("error", "growth_share")
@@ -31,7 +31,7 @@ _known: list[tuple[str, ...]] = [ABSOLUTE, PREVIEW, RELATIVE]
 
 
 def add(*observation: str) -> None:
-    """Make an observation known, by its names: policies that see it can be read."""
+    """Register an observation by the names of its numbers, so that `load` accepts policies that use it."""
     if observation not in _known:
         _known.append(observation)
 
@@ -42,11 +42,11 @@ class PolicyError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """Policy actions[argmax_a Q(M o + c, a)] of an observation o, clipped to the trained range.
+    """Greedy policy: actions[argmax_a Q(M o + c, a)] for an observation o, which is clipped to the trained range.
 
-    weights, biases: per layer (in, out) and (out,), float32. input_matrix: M (F, O); input_offset: c (F,).
-    actions: (A,), in the unit of the observation's task. low, high: limits of the observation, (O,).
-    metadata: as in the module's description.
+    weights, biases: per layer, (in, out) and (out,), float32. input_matrix: M (F, O); input_offset: c (F,).
+    actions: (A,), in the unit of the observation's task. low, high: trained range of the observation, (O,).
+    metadata: as in the docstring of this module.
     """
 
     weights: tuple[NDArray[np.float32], ...]
@@ -64,7 +64,7 @@ class Policy:
         return tuple(self.metadata["observation"])
 
     def q_values(self, observation: NDArray[Any]) -> NDArray[np.float32]:
-        """Q(observation, .), (N, O) -> (N, A), in the scale the agent was trained in."""
+        """Compute Q(observation, .), (N, O) -> (N, A), in the scale on which the agent was trained."""
         seen = np.clip(observation.astype(np.float32), self.low, self.high)
         h = seen @ self.input_matrix.T + self.input_offset
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
@@ -72,18 +72,18 @@ class Policy:
         return np.asarray(h @ self.weights[-1] + self.biases[-1], dtype=np.float32)
 
     def act(self, observation: NDArray[Any]) -> NDArray[np.intp]:
-        """Index of the greedy action, (N, O) -> (N,)."""
+        """Return the index of the greedy action, (N, O) -> (N,)."""
         return np.asarray(self.q_values(observation).argmax(axis=-1))
 
     def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the greedy action itself: a pump rate in mL/s or a fraction of the largest, (N, O) -> (N,)."""
+        """Return the greedy action in the unit of `actions`, e.g. a pump rate in mL/s, (N, O) -> (N,)."""
         return self.actions[self.act(observation)]
 
 
 STORED = {"observation_low": "low", "observation_high": "high"} | {
     name: name for name in ("input_matrix", "input_offset", "actions")
 }
-"""Array of a policy file, except those of the layers -> field of `Policy`."""
+"""Name of an array in a policy file -> field of `Policy`, for all arrays except those of the layers."""
 
 
 def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
@@ -93,7 +93,7 @@ def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
 
 
 def fingerprints(policy: Policy) -> dict[str, str]:
-    """Return the SHA-256 of each array that determines the chosen action or its meaning, by name."""
+    """Return, by name, the SHA-256 of each part of a policy that determines the chosen action or its meaning."""
     said = {key: policy.metadata.get(key) for key in ("observation", "control_min", "model")}
     arrays, limits = _arrays(policy), ("observation_low", "observation_high")
     parts = {"map of the inputs": ("input_matrix", "input_offset"), "actions": ("actions",), "limits": limits}
@@ -134,7 +134,7 @@ def load(path: Path) -> Policy:
     try:
         metadata = json.loads(str(arrays["metadata"]))
         if metadata.get("format") != FORMAT:
-            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {FORMAT}; export it anew")
+            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {FORMAT}; export it again")
         if tuple(metadata.get("observation", ())) not in _known:
             allowed = " or ".join(str(list(names)) for names in _known)
             raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
@@ -143,17 +143,17 @@ def load(path: Path) -> Policy:
         policy = Policy(weights, biases, metadata=metadata, **{f: arrays[name] for name, f in STORED.items()})
         largest = float(np.max([np.max(np.abs(a), initial=0.0) for a in (*weights, *biases)]))
         if not largest <= LARGEST:
-            raise PolicyError(f"policy {path}: a weight of size {largest:g}: allowed up to {LARGEST:g}; train it anew")
+            raise PolicyError(f"policy {path}: a weight of size {largest:g}: allowed up to {LARGEST:g}; train it again")
         q = policy.q_values(np.full((1, len(metadata["observation"])), 0.5))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
-        raise PolicyError(f"policy {path}: incomplete or of mismatched shapes ({error}); {remedy}") from None
+        raise PolicyError(f"policy {path}: arrays missing or of mismatched shapes ({error}); {remedy}") from None
     if q.shape != (1, policy.actions.size) or not np.isfinite(q).all():
         raise PolicyError(
-            f"policy {path}: {q.shape[-1]} Q values, {policy.actions.size} actions, or not finite; {remedy}"
+            f"policy {path}: {q.shape[-1]} Q values for {policy.actions.size} actions, or values not finite; {remedy}"
         )
     if not (policy.low < policy.high).all():
         raise PolicyError(
-            f"policy {path}: limits of the observation {policy.low.tolist()} to {policy.high.tolist()}: allowed low < "
-            f"high; {remedy}"
+            f"policy {path}: observation from {policy.low.tolist()} to {policy.high.tolist()}: allowed low < high; "
+            f"{remedy}"
         )
     return policy

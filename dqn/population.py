@@ -1,4 +1,4 @@
-"""Any number of agents, trained in parallel groups on the CPU's cores."""
+"""Population of agents, trained in parallel groups on the CPU's cores."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -11,14 +11,14 @@ from dqn.network import QNetwork
 from dqn.trainer import Trainer, TrainRecord
 
 GROUP = 16
-"""Agents per group on a CPU: enough to make the overhead of calling torch small, few enough for the CPU's caches."""
+"""Agents per group on a CPU: many enough that the overhead of torch calls is small, few enough for the CPU's caches."""
 
 
 def fast_arithmetic() -> None:
     """Treat numbers below 1e-38 as 0 in this thread, if the processor supports it.
 
-    An inactive unit has no gradient. Its running mean shrinks by a tenth per update down to 1e-45, where rounding stops
-    it. A processor is many times slower on such numbers. Their steps are below 1e-30, so no weight changes.
+    The gradient of an inactive unit is 0. Adam's running mean of it then shrinks by a tenth per update, down to 1e-45.
+    Processors are many times slower with such numbers. Their steps are below 1e-30, so no weight changes.
     """
     torch.set_flush_denormal(True)
 
@@ -27,11 +27,11 @@ class Population:
     """S agents in independent groups. Each group has its own copies of the environment and trains in a thread.
 
     Torch releases Python's lock during its operations, so two groups on two cores need two thirds of the sequential
-    time. The grouping, and so the result, does not depend on the number of threads.
+    time. The grouping, and therefore the result, does not depend on the number of threads.
 
     Args:
-      groups: trainers of the same config and interval; agents keep this order.
-      threads: groups trained at the same time; None means as many as there are cores for this process.
+      groups: trainers with the same config and interval; the agents are numbered in this order.
+      threads: groups trained at the same time; None: the number of cores that this process may use.
     """
 
     def __init__(self, groups: Sequence[Trainer], threads: int | None = None) -> None:
@@ -41,7 +41,7 @@ class Population:
 
     @property
     def n_agents(self) -> int:
-        """S."""
+        """Number of agents, S."""
         return sum(group.agent.n_agents for group in self.groups)
 
     @property
@@ -54,11 +54,11 @@ class Population:
 
     @property
     def network(self) -> QNetwork:
-        """Shape and constants of every agent's network, for `with_weights`; holds the first group's weights."""
+        """Network of the first group; its shape and constants hold for every agent (`with_weights`)."""
         return self.groups[0].agent.network
 
     def weights(self) -> torch.Tensor:
-        """Weights of all agents now, a copy, shape (S, P)."""
+        """Return a copy of the current weights of all agents, shape (S, P)."""
         return torch.cat([group.agent.network.flat for group in self.groups])
 
     def run(self) -> Iterator[TrainRecord]:

@@ -10,11 +10,11 @@ Array = NDArray[Any]
 
 
 class Transition(NamedTuple):
-    """Minibatches of B steps of each of S agents: observation before, action, reward, observation after.
+    """One or more minibatches of B transitions for each of S agents; "..." is an axis for several minibatches.
 
-    s_tm1, s_t: (S, ..., B, O) float32. a_tm1: (S, ..., B) int64. r_t: (S, ..., B) float32. Several minibatches have one
-    axis more than a single one.
-    continues: (S, ..., B) float32, 0 where the episode terminated (no bootstrapping), 1 also where it was truncated.
+    s_tm1, s_t: observation before and after the step, (S, ..., B, O) float32. a_tm1: action, (S, ..., B) int64.
+    r_t: reward, (S, ..., B) float32. continues: (S, ..., B) float32, 0 where the episode terminated (no bootstrapping),
+    else 1, also where it was truncated.
     """
 
     s_tm1: torch.Tensor
@@ -25,11 +25,11 @@ class Transition(NamedTuple):
 
 
 class Replay:
-    """The last `capacity` transitions of each of S agents.
+    """Memory of the last `capacity` transitions of each of S agents.
 
-    A transition is one row of 2 O + 3 float32 numbers: storing it is one copy, drawing minibatches is one gather.
+    A transition is one row of 2 O + 3 float32 numbers, so storing it is one copy and drawing minibatches is one gather.
 
-    Args: agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
+    Args: agents: S. capacity: transitions per agent. observations: O. device: where the memory is, e.g. "cpu".
     """
 
     def __init__(self, agents: int, capacity: int, observations: int, device: torch.device) -> None:
@@ -48,9 +48,9 @@ class Replay:
         return min(self.added, self.capacity)
 
     def add(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
-        """Append one transition per agent; when full, replace the oldest.
+        """Append one transition per agent; a full memory replaces its oldest transition.
 
-        Args: as the fields of `Transition`, as NumPy arrays without the axis B.
+        Args: the fields of `Transition` as NumPy arrays without the axis B.
         """
         o = self._widths[0]
         self._new[:, :o] = s_tm1
@@ -65,7 +65,7 @@ class Replay:
         """Draw transitions uniformly with replacement.
 
         Args: uniform: float64 in [0, 1), shape (S, ..., B); number v selects row floor(v * size).
-        Returns: minibatches, copies. Raises: ValueError while the memory is empty.
+        Returns: copies of the transitions. Raises: ValueError if the memory is empty.
         """
         if self.added == 0:
             raise ValueError("replay memory is empty: add transitions before sampling")

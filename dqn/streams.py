@@ -1,4 +1,4 @@
-"""Random numbers for a population: agent i draws the same numbers alone or in a population."""
+"""Random numbers for a population: an agent draws the same numbers whether it trains alone or with others."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,11 +10,11 @@ CALLS_PER_BLOCK = 128
 
 
 class UniformStream:
-    """Uniform numbers in [0, 1), `width` per agent and call, each agent from a generator of its own.
+    """Uniform numbers in [0, 1), `width` per agent and call; each agent has a separate generator.
 
-    Each generator draws the numbers of CALLS_PER_BLOCK calls at once, a block, so most calls need no Python loop over
+    Each generator draws a block at once, the numbers of CALLS_PER_BLOCK calls. So most calls need no Python loop over
     agents, and values that depend only on the numbers are computed once per block. The saved state is the position in
-    the block and the generators before that block, from which the block is drawn again. After the end of the block the
+    the block and the generators before the block, with which the block is drawn again. If the block is used up, the
     current generators are saved.
 
     Args:
@@ -41,14 +41,14 @@ class UniformStream:
         self._position = 0
 
     def take(self, calls: int) -> Any:
-        """Take the numbers of the next n calls, (S, n, ...), n = `calls` or the remaining calls of the block."""
+        """Return the numbers of the next n calls, (S, n, ...); n is `calls`, or less at the end of the block."""
         if self._position == CALLS_PER_BLOCK:
             self._refill()
         start, self._position = self._position, min(self._position + calls, CALLS_PER_BLOCK)
         return self._block[:, start : self._position]
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue; plain numbers."""
+        """Return the state needed to continue, as plain numbers."""
         used_up = self._position == CALLS_PER_BLOCK
         states = [g.bit_generator.state for g in self._generators] if used_up else self._states
         return {"generators": states, "position": self._position}

@@ -1,4 +1,4 @@
-"""The loop of agent and environment as a generator; the caller counts, logs, evaluates and stops."""
+"""Training loop of agents and environment, a generator of records. The caller logs, evaluates and stops."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Step = tuple[
 
 
 class TrainingEnv(Protocol):
-    """A vector environment with one copy per agent, SAME_STEP autoreset, whose state can be saved."""
+    """Vector environment with one copy per agent and SAME_STEP autoreset; its state can be saved."""
 
     def reset(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start episodes in all copies."""
 
     def step(self, actions: NDArray[np.intp]) -> Step:
-        """One step in all copies; infos["final_obs"] holds last observations where an episode ended."""
+        """Run one step in all copies; infos["final_obs"] holds the last observation of each episode that ended."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Complete state."""
+        """Return the complete state."""
 
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
-        """Restore it; returns the current observations."""
+        """Restore a state; return the current observations."""
 
 
 class Agent(Protocol):
-    """S agents that learn in parallel, each in its own copy of the environment; `DQNAgent` is one kind.
+    """Interface of S agents that learn in parallel, each in its own copy of the environment; `DQNAgent` is one kind.
 
-    config: with `kind` and `total_steps`. network: of all agents; its largest output is the greedy action. The greedy
-    policy is scored, kept and exported. steps: of the environment so far. updates: gradient steps so far.
+    config: has `kind` and `total_steps`. network: the networks of all agents; the action with the largest output is
+    greedy, and this policy is scored and exported. steps: environment steps so far. updates: gradient steps so far.
     """
 
     config: Any
@@ -63,26 +63,26 @@ class Agent(Protocol):
     ) -> None:
         """Process one step of every agent and learn from it.
 
-        Args: s_tm1, s_t: before and after it, (S, O). continues: bootstrap from s_t, (S,). ended: the next step begins
-        a new episode, (S,). Both are true at the last step of a truncated episode.
+        Args: s_tm1, s_t: observation before and after the step, (S, O). continues: whether to bootstrap from s_t, (S,).
+        ended: whether the episode ended, (S,). Both are true at the last step of a truncated episode.
         """
 
     def curves(self) -> Curves:
-        """Return the values to log, by tag: one number per agent, (S,), or one for all."""
+        """Return the values to log, by tag: one number per agent, (S,), or one number for all agents."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return tensors and plain values from which a new agent of the same config continues to the bit."""
+        """Return tensors and plain values from which a new agent with the same config continues bit for bit."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
+        """Restore a saved state."""
 
 
 @dataclass(frozen=True)
 class TrainRecord:
     """Record of one interval of training; arrays have one entry per agent, shape (S,).
 
-    episode_return: undiscounted reward of the last episode that ended in the interval, else nan.
-    curves: of `Agent.curves`, by tag.
+    episode_return: sum of rewards of the last episode that ended in the interval, nan if none ended.
+    curves: the values of `Agent.curves`, by tag.
     """
 
     step: int
@@ -101,9 +101,9 @@ class TrainRecord:
 
 
 class Trainer:
-    """Loop in which S agents act in S copies of the environment and learn.
+    """Training loop: S agents act in S copies of the environment and learn.
 
-    Args: env: one copy per agent. agent: the S agents. interval: steps between records.
+    Args: env: the S copies. agent: the S agents. interval: environment steps between records.
     """
 
     def __init__(self, env: TrainingEnv, agent: Agent, interval: int) -> None:
@@ -115,7 +115,7 @@ class Trainer:
         self._observation: NDArray[np.float32] | None = None
 
     def run(self) -> Iterator[TrainRecord]:
-        """Train until the config's total_steps, yielding a record every `interval` steps and at the end."""
+        """Train up to `total_steps` of the config; yield a record every `interval` steps and at the end."""
         if self._observation is None:
             self._observation, _ = self.env.reset()
         total = self.agent.config.total_steps
@@ -131,7 +131,7 @@ class Trainer:
             self._step()
 
     def _step(self) -> None:
-        """Run one environment step of every agent and the due updates."""
+        """Run one environment step of every agent and the updates that are due."""
         assert self._observation is not None
         agent = self.agent
         before = self._observation

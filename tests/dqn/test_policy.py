@@ -88,12 +88,12 @@ def _metadata(**changes: Any) -> np.ndarray:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"w1": None}, "incomplete or of mismatched shapes"),
-        ({"b0": np.zeros(5, np.float32)}, "incomplete or of mismatched shapes"),
-        ({"metadata": np.array("not json")}, "incomplete or of mismatched shapes"),
+        ({"w1": None}, "arrays missing or of mismatched shapes"),
+        ({"b0": np.zeros(5, np.float32)}, "arrays missing or of mismatched shapes"),
+        ({"metadata": np.array("not json")}, "arrays missing or of mismatched shapes"),
         ({"metadata": _metadata(format=3)}, "format 3: allowed 2"),
         ({"metadata": _metadata(observation=["od"])}, "observation"),
-        ({"actions": np.zeros(16)}, "17 Q values, 16 actions"),
+        ({"actions": np.zeros(16)}, "17 Q values for 16 actions"),
         ({"b2": np.full(17, np.nan, np.float32)}, "a weight of size nan"),
         ({"b1": np.full(64, -np.inf, np.float32)}, "a weight of size inf"),
         ({"b0": np.full(64, -1e25, np.float32)}, "a weight of size 1e\\+25"),
