@@ -8,10 +8,10 @@ from hardware.errors import DeviceStateError
 
 
 class Fault(Message):
-    """Something wrong with one reactor: kind, observation, remedy.
+    """Fault of one reactor: its kind, what was observed, the remedy.
 
-    Attributes: response, what the interlock does about it, a word of `hardware.safety.config.WORDS`; kind, by which
-      settings and records name it: the class that declares the response, with underscores and without "Fault".
+    Attributes: response: what the interlock does, a key of `hardware.safety.config.WORDS`. kind: name of the fault in
+      settings and records, from the class that declares the response: NoDilutionFault gives "no_dilution".
     """
 
     kind: ClassVar[str] = ""
@@ -27,7 +27,7 @@ class Fault(Message):
         return f"{self.kind}: {super().__str__()}"
 
     def line(self, done: str) -> str:
-        """Say it with what was done about it."""
+        """Return the fault in one line: kind, sentence, what was done, remedy."""
         return f"{self.kind}: " + "; ".join(filter(None, (self.sentence, done, self.remedy)))
 
 
@@ -48,22 +48,22 @@ class UndosedFault(Fault, response="report"): ...
 class NoDose(Message, says="no dose: {why}"):
     """No dose was begun for this sample; the culture grows undiluted."""
 class NoNewSample(Message, says="no new sample"):
-    """The sample was already used, or none has arrived yet."""
+    """The newest sample was already used, or no sample has arrived yet."""
 class DoseUnderWay(Message, says="the previous dose has not ended"):
     """Its pumps are not yet verified off; if this persists, see the fault of kind pump."""
-class OpenDose(Message, says="a dose of {ml:.2f} mL was open when the program ended",
-    remedy="look at the level and at the bottle"):
-    """The program was killed in a dose; the next note has its volume, if not as planned."""
+class OpenDose(Message, says="a dose of {ml:.2f} mL was unfinished when the program ended",
+    remedy="check the level and the bottle"):
+    """The program was killed during a dose. A note with the volume follows if it was not as planned."""
 class NotLeftOff(DeviceStateError, says="{why}; {failed}"): ...
 class PumpsNotOff(DeviceStateError, says="pumps not verified off: {failed}",
     remedy="pull the plug of the pump boards now"): ...
 class PreflightFailed(DeviceStateError, says="preflight: {count} of {of} checks failed, the first: {first}"): ...
 class PumpsNotLookedAt(Message, says="stopped before the pumps were checked: pumps not verified off",
-    remedy="look at the pumps, resume the run"):
-    """A pump may be on since the run was interrupted."""
-class ClockMoved(Message, says="this computer's clock moved by {by_min:.1f} min since the run's last row: "
-    "the run goes on at minute {minute:.1f}, without that step", remedy="set its clock right, look at its battery"):
-    """The clock was set while no program ran; the run uses the device's cycles and the monotonic clock."""
+    remedy="look at the pumps, then resume the run"):
+    """A pump may still be on from before the interruption."""
+class ClockMoved(Message, says="this computer's clock was set by {by_min:.1f} min since the run's last row; "
+    "the run ignores this and continues at minute {minute:.1f}", remedy="correct the clock, check its battery"):
+    """The run uses the device's cycles and the monotonic clock instead."""
 class ClockDoubtful(Message,
     says="the length of the interruption is known only from this computer's clock, which may be wrong",
     remedy="compare the minute in the next line with a watch"):

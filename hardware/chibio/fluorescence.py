@@ -85,7 +85,7 @@ class Fluorescence:
         slot = self._config.slot
         self.trouble = SlotAmiss(slot=slot, found=still) if still else None
         if found and not still and self._was_on:
-            self._book.tell(PutRight(item=f"the fluorescence slot {slot}", found=found, done="switched on again"))
+            self._book.tell(PutRight(item=f"fluorescence slot {slot}", found=found, done="switched on again"))
         self._was_on = self._was_on or not still
         return state
 

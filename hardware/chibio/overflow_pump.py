@@ -87,5 +87,5 @@ class OverflowPump:
         self._book.log("overflow_pump", pump=config.pump, duty=config.duty, found=found)
         if known:
             done = f"set to {config.duty:g} and on"
-            self._book.tell(PutRight(item=f"the overflow pump, {config.pump},", found=found, done=done))
+            self._book.tell(PutRight(item=f"overflow pump {config.pump}", found=found, done=done))
         return state

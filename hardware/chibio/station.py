@@ -178,7 +178,7 @@ class ChibioStation(Station):
         try:
             self.doses.settle(tries=3)
             if kind == "stalled":
-                self._ended = "it brought no sample any more"
+                self._ended = "no more samples came"
                 self.connection.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
             elif kind == "restarted":
@@ -285,7 +285,7 @@ class ChibioStation(Station):
         """Set a pump's target to a number again, before the device works with it; tell where it has."""
         for item in state.spoilt:
             if item in PUMPS and math.isnan(state.pump_targets[PUMPS.index(item)]):
-                self._mend("set to no number by somebody", "set to 0", self.connection.target, item, 0.0)
+                self._mend("set to nan by somebody", "set to 0", self.connection.target, item, 0.0)
             elif not self._spoilt:
                 self.book.tell(messages.DumpWillFail(items=", ".join(state.spoilt)))
                 self._spoilt = True
@@ -337,7 +337,7 @@ class ChibioStation(Station):
         self.regulated_od = setpoint
 
     def _hand_over_again(self) -> None:
-        state, done = self.connection.read(), "left to it"
+        state, done = self.connection.read(), "unchanged"
         if not regulates(state, self.regulated_od):
             self.regulate(self.regulated_od)
             done = f"handed over again, because its {describe(state)}"

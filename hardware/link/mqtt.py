@@ -68,7 +68,7 @@ class MqttLink:
             self._is_up = True
 
     def _down(self, _client: Any, _user: Any, _flags: Any, reason: Any, *_: Any) -> None:
-        self.lost = "it answers no more" if "alive" in str(reason) else "it closed the connection"
+        self.lost = "no more answers" if "alive" in str(reason) else "the broker closed the connection"
         self.broke_s = self._clock.now() if self._is_up else self.broke_s
         self._is_up = False
 

@@ -245,7 +245,7 @@ class Doses:
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
-            self._give(job, moved.low, moved.high, f"{job} ran without its job")
+            self._give(job, moved.low, moved.high, f"the pump of {job} ran without its job")
         if job != WASTE:
             self._job = job
             self._ran_on = self._ran_on or moved.high > LATE_ML
@@ -278,7 +278,7 @@ class Doses:
             self.pumps.counted[job, source] = counted + over
             self._strange_ml[job] += over
             if source == self.pumps.short:
-                self._give(job, over, over, f"{job} to end with its pin off")
+                self._give(job, over, over, f"short run of {job} to switch its pin off")
                 continue
             self._theirs(job, over, "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}")
 

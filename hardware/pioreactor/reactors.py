@@ -60,7 +60,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         for station, error in failed.items():
             if not histories or len(failed) == len(past):
                 raise error.about(station.name)
-            screen.warning("%s: not taken over, the others go on: %s", station.name, error)
+            screen.warning("%s: not taken over, the others continue: %s", station.name, error)
             station.postpone_start(error, past[station])
 
     def connect(self) -> None:

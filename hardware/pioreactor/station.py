@@ -179,7 +179,7 @@ class PioreactorStation(Station):
             return self.doses.foreign
         if job := next((job for job in self._wanted() if job in self._gone), ""):
             twice = job in self._ended and self._real.now() > self._asked_s.get(job, -math.inf) + GRACE_S
-            again = "it ended twice, start it in the vendor's page" if twice else "asked for again"
+            again = "the job ended twice, start it in the vendor's page" if twice else "the program requests it again"
             if job == OD and (said := self._box.complaint):
                 return messages.ReaderComplains(log=said)
             if self._real.now() > self._box.heard_s + SILENT_S:

@@ -69,10 +69,10 @@ class Web:
         except NotHeard as error:
             if error.fields.get("status") != 404:
                 raise
-            return "the leader knows no experiment that it is in"
+            return "the leader lists the unit in no experiment"
         if (found := str(said.get("experiment"))) != self._experiment:
-            return f"it is in the experiment {found}"
-        return "" if said.get("is_active", 1) else "it is inactive"
+            return f"the unit is in the experiment {found}"
+        return "" if said.get("is_active", 1) else "the unit is inactive"
 
     def result(self, task: str) -> bool | None:
         """Whether a task's process may be there; None: it waits, or was asked before. Raises: as `get`."""

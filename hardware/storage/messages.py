@@ -1,4 +1,4 @@
-"""Errors of a run's files; each ends a run, pumps verified off, or a resume."""
+"""Errors of a run's files: each one ends the run, with the pumps verified off, or prevents a resume."""
 
 from conf.messages import Message
 from hardware.errors import RecordingError
@@ -8,7 +8,7 @@ from hardware.errors import RecordingError
 class NotWritten(RecordingError, says="{path}: {why}", remedy="free disk space, then resume the run"):
     """The disk is full or gone; the run ends."""
 class NotOpened(RecordingError, says="{path}: {why}", remedy="check folder, rights and disk"): ...
-class JournalTaken(RecordingError, says="journal {path}: another program writes this run", remedy="end that first"):
+class JournalTaken(RecordingError, says="journal {path}: another program writes this run", remedy="end it first"):
     """Two programs would write one run; nothing was changed."""
 class JournalMissing(RecordingError, says="journal {path}: missing or empty",
     remedy="restore it or start a new run"): ...
@@ -20,5 +20,5 @@ class WrongRow(RecordingError, says="{path}: row lacks columns {missing} and has
     remedy="report it"):
     """An error in the program; the run ends."""
 class MarksDamaged(RecordingError, says="{path}: damaged ({why})", remedy="repair it or move it away"): ...
-class TornLine(Message, says="{path}: cut a torn last line of {length} bytes"):
-    """A kill or a power cut while a row was written; nothing else is lost."""
+class TornLine(Message, says="{path}: removed an incomplete last line of {length} bytes"):
+    """The program was killed or lost power while it wrote a row. Nothing else is lost."""

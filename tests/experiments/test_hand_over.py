@@ -117,8 +117,8 @@ def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_pat
     run.begin()
     assert not [path for path in paths if "Pump" in path or "OD" in path]  # not even interrupted
     regulated_at(run)
-    notes = [row["note"] for row in run.journaled("note")]
-    assert "handed over to the on-board regulation at OD 0.5 earlier in this run: left to it" in notes
+    notes = [row["fields"] for row in run.journaled("note") if row["name"] == "StaysHandedOver"]
+    assert {"setpoint": 0.5, "done": "unchanged"} in notes
     monkeypatch.setattr(run.loop, "run", lambda: ())
     with caplog.at_level("INFO"):
         assert control._run(run.loop, run.record, lambda *_: None) == "completed"
@@ -193,8 +193,7 @@ def test_a_new_run_takes_control_back_and_says_so(tmp_path: Path) -> None:
     run.begin()
     run.live(10)
     assert run.data()["OD"]["ON"] == 0
-    notes = [row["note"] for row in run.journaled("note")]
-    assert "the on-board OD regulation was found on and switched off: this run controls" in notes
+    assert "RegulationFoundOn" in [row["name"] for row in run.journaled("note")]
     assert [row for row in run.journaled("intent") if row["feed_ml"] > 0.0]
     assert not run.reactors.handed_over.any()
 

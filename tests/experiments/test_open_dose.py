@@ -333,9 +333,9 @@ def said(caplog: pytest.LogCaptureFixture, notes: list[tuple[float, str]]) -> li
 
 
 def test_a_note_of_one_reactor_silences_no_other_and_what_has_doubled_is_told_again(caplog):
-    same = "a dose of 1.05 mL was repeated up to {} times by the device"
+    same = "the device repeated a dose of 1.05 mL up to {} times"
     notes = [(0.0, f"M0: {same.format(1)}"), (1.0, f"M1: {same.format(1)}"), (2.0, f"M2: {same.format(1)}")]
-    notes += [(60.0, f"M0: {same.format(9)}"), (61.0, "M0: pumps on: Pump1"), (62.0, "M0: pumps on: Pump3")]
+    notes += [(60.0, f"M0: {same.format(9)}"), (61.0, "M0: on: Pump1"), (62.0, "M0: on: Pump3")]
     quiet = [(120.0, f"M0: {same.format(8)}"), (180.0, "M0: 0.01 mL kept"), (240.0, "M0: 0.011 mL kept")]
     heard = said(caplog, [*notes, *quiet])
     assert heard == [note for _, note in [*notes, quiet[1]]]

@@ -28,7 +28,7 @@ Steps = Sequence[tuple[str, Reply | Exception]]
 Act = tuple[Any, ...]  # error or None, its words, method, arguments
 LOOK, NO_M0 = "GET /getSysdata/", {"M0": 0, "M1": 1}
 HERE, GONE = (LOOK, answer(state("M1"))), (LOOK, answer(state("M1", presentDevices=NO_M0)))
-ABSENT, UNSEEN = (DeviceStateError, "absent"), (DeviceStateError, "not seen present", "post")
+ABSENT, UNSEEN = (DeviceStateError, "absent"), (DeviceStateError, "refused to send", "post")
 READ, SENT, PAUSE = (None, "", "read"), (None, "", "post", OFF[0]), (None, "", "sleep", 3.0)
 ALL_OFF = (None, "", "pumps_off")
 
@@ -63,7 +63,7 @@ CASES: dict[str, tuple[Steps, list[Act]]] = {
     ),
     "an answer of an earlier time comes again, by its record or its count of cycles": (
         [*at(120.3, 3), *at(60.2, 3), *at(120.3, 2), *at(120.3, 3), *at(0.07, 1, "2026-01-02 00:00:00")],
-        [READ, *(2 * [(LinkError, "earlier time", "read")]), READ, READ],
+        [READ, *(2 * [(LinkError, "old answer", "read")]), READ, READ],
     ),
     "a board's clock that went back by an hour, with winter time": ([*at(3780.3, 64), *at(240.4, 65)], [READ, READ]),
     "another client's selection: the pair is repeated": (2 * read(state("M1")) + read(state()), [READ]),

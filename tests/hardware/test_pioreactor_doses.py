@@ -408,7 +408,7 @@ def test_five_times_faster_a_period_of_two_minutes_is_dosed_whole_and_an_old_sam
     lab.world.od_alive = False
     lab.world.sleep(30.0)  # 150 s of the culture
     assert lab.dose(0.9) == 0.0
-    assert "no dose: its sample is stale" in [row["note"] for row in lab.of("note")]
+    assert "SampleStale" in [row["fields"]["why"]["name"] for row in lab.of("note") if row["name"] == "NoDose"]
 
 
 def test_pumps_off_while_a_run_goes_on_lets_the_waste_pump_end(lab):

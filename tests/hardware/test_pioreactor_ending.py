@@ -242,7 +242,7 @@ def test_every_way_back(monkeypatch, name, version, stirring):
     assert level <= 20.0 + 1.5, "by the interlock's ledger the vial is no higher than by a dose"
     assert float(ledger.fed_ml[0]) == pytest.approx(high, abs=SLACK_ML)
     assert len(lab.asked("add_media")) <= int(planned > 0.0), "never asked for again"
-    shorts = [row["feed_ml"] for row in lab.of("given") if "to end with its pin off" in row["why"]]
+    shorts = [row["feed_ml"] for row in lab.of("given") if "short run" in row["why"]]
     assert sum(shorts) <= 3.01 * 0.1 * FLOW["add_media"]
     beside = 7.0 + 4.0 * ("unit knew" in name)  # nobody says that it ended until a short run or a reboot is told
     if name != "waste killed":

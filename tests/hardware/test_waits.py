@@ -134,7 +134,7 @@ def test_what_one_reactor_waited_for_in_vain_the_others_do_not_wait_for_again() 
     failed = lab.reactors.pumps_off(np.ones(4, dtype=np.bool_))
     assert len(failed) == 4
     assert lab.clock.now() - began < 21.0  # one time-out, not eight
-    assert "not sent, a moment ago" in failed[-1]
+    assert "not sent" in failed[-1]
     lab.fault("lost_request", 0)
     lab.clock.sleep(3.0)
     assert lab.reactors.pumps_off(np.ones(4, dtype=np.bool_)) == []
