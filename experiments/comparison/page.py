@@ -334,7 +334,7 @@ def _in_short(out: Page, summary: Row) -> None:
     alone = [] if items or summary["beside_paper"] else [_alone(summary, e) for e in summary["totals"] if _runs(e)]
     learned = summary["beside_paper"] and _find(beside(summary), controller="dqn")
     if items or alone or learned:
-        out.section("In short")
+        out.section("Summary")
     if learned:
         _beside_paper(out, summary)
     if items:
