@@ -599,7 +599,7 @@ def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
     told = replace(one, cell=ShareCell("midpoint", "p", "s"), foresight=True, share=one.share + 0.3)
     told = replace(told, temperature=one.temperature + 2.0, setpoint=one.setpoint + 0.3)
     axes = comparison.shares([told, one]).axes
-    assert [ax.get_title() for ax in axes] == ["midpoint, told ahead", "pi", "", ""]
+    assert [ax.get_title() for ax in axes] == ["midpoint, with preview", "pi", "", ""]
     assert [float(ax.lines[0].get_ydata()[0]) for ax in axes] == pytest.approx([0.6, 0.3, 33.0, 31.0])
     assert [float(ax.lines[1].get_ydata()[0]) for ax in axes[:2]] == pytest.approx([0.65, 0.35])
 
@@ -618,7 +618,7 @@ def test_errors_of_a_share_have_the_mark_of_their_law_in_the_row_of_their_plant(
     (ax,) = drawn.axes
     assert [text.get_text() for text in ax.get_yticklabels()] == ["wide", "narrow"]
     marks = legend(drawn)
-    assert list(marks) == ["pi", "midpoint", "midpoint, told ahead"]
+    assert list(marks) == ["pi", "midpoint", "midpoint, with preview"]
     assert len(set(marks.values())) == 3
     pi, midpoint, told = marks.values()
     assert dots(ax) == {

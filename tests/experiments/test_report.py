@@ -151,7 +151,7 @@ def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
         "ISE of the noise-free OD (OD² min), sum over the windows": "5",
         "ITAE of the noise-free OD (OD min²), sum over the windows": "6", "Steady error of the noise-free OD": "7",
         "Control effort (µL/s per decision)": "8", "Fresh medium used (mL per vial)": "9",
-        "Samples on which the interlock allowed no dose, per vial": "10",
+        "Samples after which the interlock allowed no dose, per vial": "10",
     }  # fmt: skip
     assert {table.columns[:3] for table in page.tables} == {("plant", "a", "b")}
     for key, law in zip(RANKED, LAWS, strict=True):
@@ -190,7 +190,7 @@ def test_in_short_the_lowest_of_each_plant_is_named_and_the_oracle_is_not():
     text = page.html()
     assert "<h2>Summary</h2>" in text
     assert "<li>density on p: mpc 8.5, then dqn 9</li>" in text
-    assert "<li>share on p: midpoint, told ahead 0.04, then pi 0.045</li>" in text
+    assert "<li>share on p: midpoint, with preview 0.04, then pi 0.045</li>" in text
     assert "Lowest mean |r - setpoint| and ITAE, OD min², mean of the replicates:" in text
 
 
