@@ -1,3 +1,3 @@
 """Comparison of controllers on simulated plants: trials, statistics, the paper's numbers, figures and page.
 
-Benchmark and report import it."""
+The commands `benchmark` and `report` import it."""

@@ -10,12 +10,12 @@ from envs.task import EnvConfig
 from experiments.laws import registry
 from experiments.training.config import agent_schema
 
-TWIN = "twin"  # the plant of a plant_file
+TWIN = "twin"  # name of the plant that plant_file describes
 
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """A study: every controller on every plant in every scenario; names are keys of the config's groups."""
+    """Study that runs every controller on every plant in every scenario; all are named by their keys in the config."""
 
     scenarios: tuple[str, ...] = setting(("setpoint_steps",), "names of scenarios")
     plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
@@ -24,30 +24,34 @@ class StudyConfig:
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """The closed loops to compare. Raises: ValueError with key, value and allowed values."""
+    """Config of a benchmark: the closed loops to compare. Raises: ValueError with key, value and allowed values."""
 
     replicates: int = setting(
         3, "vials per controller, plant and scenario (paper: 3), run as one batch", within=(1, 10_000)
     )
     seed: int = setting(
-        0, "random seed of plants, noise, training and calibration, equal for every controller", at_least=0
+        0, "random seed of plants, noise, training and calibration; all controllers use the same seed", at_least=0
     )
-    env: EnvConfig = part(EnvConfig, "model for model-based controllers and for training")
+    env: EnvConfig = part(EnvConfig, "culture model that model-based controllers and training use")
     agents: dict[str, Any] = setting({}, "learned controllers by name", kinds=agent_schema)
-    train_seeds: int = setting(4, "seeds per agent; the best policy on the selection grid is used", within=(1, 1000))
+    train_seeds: int = setting(
+        4, "seeds per agent; the policy that is best on the selection grid is used", within=(1, 1000)
+    )
     workers: int = setting(
-        0, "processes for the closed loops; 0: one per core, 1: only this one. No effect on results", within=(0, 256)
+        0,
+        "processes that run the closed loops; 0: one per core, 1: no extra process. No effect on results",
+        within=(0, 256),
     )
     policies: dict[str, str] = setting(
         {},
-        "policies of learned controllers by name, instead of training: a policy.npz, a run folder, `shipped`, or the "
-        "folder policies/ of a training (one row per seed). A controller with neither policy nor agent uses `shipped`",
+        "trained policies by controller's name: a policy.npz, a run folder, `shipped`, or the folder policies/ of a "
+        "training (one row per seed). A learned controller with neither policy nor agent uses `shipped`",
     )
     calibration: bool = setting(False, "simulate and fit the open-loop protocol (Fig. 2a)")
     training: bool = setting(False, "train all agents, also those that no study needs (Fig. 2b)")
     plants: dict[str, PlantConfig] = setting({}, "plants by name")
     plant_file: str | None = setting(
-        None, "a twin.yaml of calibrate, as plant `twin`; each vial starts at a random time within its knots"
+        None, "twin.yaml written by calibrate, used as plant `twin`; each vial starts at a random time of its recording"
     )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
     controllers: dict[str, Any] = setting({}, "controllers by name", kinds=registry.config_at)
@@ -71,13 +75,13 @@ class BenchmarkConfig:
 
 
 SETTLING_MIN = 10.0
-"""Average settling time at a setpoint of 0.5, min; the paper does not define its band."""
+"""The paper's average settling time at a setpoint of 0.5, min. The paper does not define the band."""
 
 
 class Published(NamedTuple):
-    """One pair of cells of the paper's table (Brancato et al., L4DC 2024, Table 2): real reactors, three replicates.
+    """ISE and ITAE of a controller in the paper (Brancato et al., L4DC 2024, Table 2): real reactors, 3 replicates.
 
-    window: setpoint or temperature. ise, itae: T read as 1 min.
+    window: label of the setpoint or temperature. ise, itae: with T = 1 min, which the paper does not state.
     """
 
     scenario: str

@@ -1,4 +1,4 @@
-"""Figures of a benchmark, from trials and from the rows of its summary."""
+"""Figures of a benchmark, drawn from its trials and from the rows of its summary."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK_MIN = 10.0
-LEAST = 1e-9  # end of an interval that reaches zero on a logarithmic axis
-NOISELESS = 1e-5  # lower scores are those of a plant without noise
+LEAST = 1e-9  # drawn lower end, on a logarithmic axis, of an interval that reaches zero
+NOISELESS = 1e-5  # a lower score means that the plant has no noise
 
 MARKS = {
     "dqn": (COLOURS[0], "o"),
@@ -50,7 +50,7 @@ def _handles(controllers: Sequence[str]) -> list[Line2D]:
 def estimate(
     ax: Axes, mark: tuple[str, str], y: float, value: float, interval: Sequence[float], hollow: bool = False
 ) -> None:
-    """Draw a controller's mark with its 95 % interval, if any."""
+    """Draw a value as a controller's mark, and its interval as a line unless it is nan. Args: mark: colour, marker."""
     colour, marker = mark
     if np.isfinite(interval[0]):
         ax.plot(interval, [y, y], color=colour, linewidth=1.3)
@@ -58,7 +58,7 @@ def estimate(
 
 
 def _band(ax: Axes, time: Array, values: Array, colour: str) -> None:
-    """Draw the mean over replicates and one standard deviation around it; values (N, K)."""
+    """Draw the mean over replicates, and a band of ± one standard deviation. Args: values: (N, K)."""
     mean = values.mean(axis=0)
     if values.shape[0] > 1:
         sd = values.std(axis=0, ddof=1)
@@ -67,7 +67,7 @@ def _band(ax: Axes, time: Array, values: Array, colour: str) -> None:
 
 
 def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
-    """Time (K,), OD, pump rate and temperature (N, K): as recorded, or block means without noise in a long scenario."""
+    """Return minutes (K,), OD, pump rate, temperature (N, K); a long scenario: block means, noise-free OD."""
     last = trial.minute.size - 1
     if trial.schedule.total_min <= LONG_MIN:
         return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]
@@ -82,7 +82,7 @@ def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
 
 
 def bands(trials: Sequence[DensityTrial]) -> Figure:
-    """Draw OD above pump rate (above temperature), a column per controller: mean over replicates, band = one sd."""
+    """Draw OD, pump rate and, if it is switched, temperature; a column per trial. Line: mean; band: ± one sd."""
     first = trials[0]
     switched = len(set(first.schedule.temperatures)) > 1
     rows, ratios = (3, [2.2, 1.1, 0.9]) if switched else (2, [2.2, 1.1])
@@ -116,7 +116,7 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
 
 
 def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the cells of the paper's Table 2 (hollow) beside this run's (filled, bar = 95 % interval of the mean)."""
+    """Draw the values of the paper's Table 2 (hollow) and of this run (filled; bar: 95 % interval of the mean)."""
     cells = list(dict.fromkeys((p.scenario, p.window) for p in TABLE_2))
     names = [f"{w} °C" if s == "temperature_switch" else f"OD {w}" for s, w in cells]
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
@@ -147,9 +147,9 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
 def by_plant(
     entries: Sequence[Mapping[str, Any]], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
 ) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
-    """Create empty panels, one per metric, with a striped row per plant; return also the height of an entry.
+    """Create empty panels with one row per plant; return figure, axes, and a function (entry) -> vertical position.
 
-    Args: entries: of all drawn plants and controllers. handles: of the legend.
+    Args: entries: of all plants and controllers to draw. handles: of the legend. panels: number of panels.
     """
     names = list(dict.fromkeys(str(e["plant"]) for e in entries))
     controllers = list(dict.fromkeys(law_of(e) for e in entries))
@@ -183,12 +183,12 @@ def _log_axis(ax: Axes) -> None:
 
 
 def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of all but `hold`.
+    """Draw ISE and ITAE, summed over the windows, one row per plant: mean and 95 % interval. `hold` is left out.
 
-    Args: entries: of `statistics.totals`, all of one scenario.
+    Args: entries: from `statistics.totals`, all of one scenario.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
-    # One floor is drawn: all controllers met the same sensors, so their floors nearly agree.
+    # One floor per plant is drawn: all controllers have the same sensors, so their floors nearly agree.
     witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
     figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), floor_line])
@@ -208,12 +208,12 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
-    """Draw paired differences of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval.
+    """Draw paired differences of ISE and ITAE to the controller `against`, in % of its mean, with 95 % intervals.
 
-    Args: entries: of `statistics.pairs` by `total_scores`, all of one scenario; against: the controller at zero.
+    Args: entries: from `statistics.pairs` with `total_scores`, all of one scenario.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
-    open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")
+    open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval includes 0")
     figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), open_mark])
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         ax.axvline(0.0, color="black", linewidth=1.0)

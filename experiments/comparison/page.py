@@ -1,4 +1,4 @@
-"""The page of a benchmark: the paper's Table 2 beside the run's, every plant, what the learned policy loses."""
+"""The page of a benchmark: the paper's Table 2 beside this run's, all plants, and where the learned policy loses."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -17,41 +17,40 @@ PUBLISHED = ("dqn", "pi", "mpc")
 UNITS = {"ise": "OD² min", "itae": "OD min²"}
 
 DENSITY = {
-    "error e": "measured OD minus setpoint, once a minute. A sample at the very end of a window belongs to it and to "
-    "the next one.",
+    "error e": "measured OD minus setpoint, once a minute. A sample at the end of a window belongs to this and to the "
+    "next window.",
     "ISE and ITAE, T = 1 min": "ISE = (1/T) ∫ e² dt, ITAE = (1/T) ∫ t |e| dt, t in min from the start of the window, "
-    "trapezoidal rule. The paper leaves T open; T = 1 min, the control period, is the only reading under which its "
-    "table is consistent.",
+    "trapezoidal rule. The paper does not state T; its table is consistent only with T = 1 min, the control period.",
     "ISE and ITAE, T = window": "the same integrals divided by the window's length (30 min in Table 2).",
     "settling time": "minutes after which |e| stays within 5 % of the setpoint to the end of the window; median over "
-    "replicates, a dash where half or more never settle. The paper does not define its band.",
+    "replicates. A dash: half of the replicates or more never settle. The paper does not define its band.",
     "steady error": "mean |e| over the last 10 min of a window.",
-    "sensor-noise floor": "the score of the sensor's error alone (reading minus noise-free reading), i.e. of a "
-    "culture exactly on the setpoint.",
-    "oracle": "dynamic programming on each vial's own growth rate, pump and volume, seeing the OD without noise and "
-    "not knowing setpoints ahead. On the plant nominal nothing that starts a window from the same OD has a lower ISE; "
-    "elsewhere it shows what full knowledge of the present is worth.",
+    "sensor-noise floor": "score of the sensor's error alone (reading minus noise-free reading). A culture exactly on "
+    "the setpoint has this score.",
+    "oracle": "dynamic programming with each vial's true growth rate, pump, volume and noise-free OD, but without "
+    "knowledge of future setpoints. On the plant nominal, no controller that starts a window from the same OD has a "
+    "lower ISE; on other plants the oracle shows the benefit of knowing the present state exactly.",
     "noise-free": "the same metrics on the noise-free OD.",
-    "interlock": "stands between every controller and the pumps, with the limits of a bench; a rejected "
-    "reading gets no dose from any controller.",
+    "interlock": "checks every command between controller and pumps, with the limits of a real bench. After a rejected "
+    "reading it allows no dose, whatever the controller.",
     "control effort": "mean change of the pump rate from one decision to the next, µL/s.",
-    "paired difference": "controller minus the other, replicate by replicate: both meet the same vials, pumps, sensors "
-    "and noise. 95 % interval: Student's t of the mean over replicates, without correction for the number of "
-    "comparisons.",
+    "paired difference": "one controller's score minus the other's in the same replicate, that is with the same vial, "
+    "pump, sensor and noise. 95 % interval: Student's t of the mean over replicates, without correction for the number "
+    "of comparisons.",
     "±": "one standard deviation over replicates.",
 }
 RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
-"""Signal -> the measure by which a page says in short what is lowest, and its name; a guest adds its own."""
+"""Signal -> key and label of the measure that ranks controllers in the page's summary; a guest adds its own signal."""
 OUT_OF_COMPETITION = ("oracle", "optimum")
 
 
 def law_of(entry: Row) -> str:
     """Return the displayed name of an entry's controller."""
-    return f"{entry['controller']}, told ahead" if entry.get("preview") else str(entry["controller"])
+    return f"{entry['controller']}, with preview" if entry.get("preview") else str(entry["controller"])
 
 
 def name_of(scenario: str, window: str) -> str:
-    """Return the displayed name of a window."""
+    """Return the displayed name of a window: its temperature, hours or OD."""
     return f"{window} °C" if scenario == "temperature_switch" else window if "h" in window else f"OD {window}"
 
 
@@ -78,10 +77,10 @@ def beside(summary: Row) -> list[Row]:
 
 
 def table_2(rows: Sequence[Row], metric: str) -> Table:
-    """Build the paper's table for one metric beside this run's.
+    """Build a table of one metric: the paper's values, and beside them the values of this run.
 
-    The lowest of the paper's three controllers is named on each side. Controllers outside the paper follow in further
-    columns. Marked is the lowest of each side, without the oracle.
+    Controllers that are not in the paper have further columns. The lowest value of each side is marked, ignoring the
+    oracle. The last two columns name the lowest of the paper's three controllers on each side.
     """
     body: list[tuple[str, ...]] = []
     others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
@@ -112,7 +111,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
 
 
 class Loss(NamedTuple):
-    """Sentence about a published controller that is lower than the learned policy in a cell of the table."""
+    """Cell of the table in which one of the paper's controllers scores lower than the learned policy."""
 
     cell: str
     certain: bool  # the 95 % interval of the paired difference excludes 0
@@ -120,7 +119,7 @@ class Loss(NamedTuple):
 
 
 def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> list[Loss]:
-    """List published controllers that are lower than the learned policy, cell by cell, the lowest first."""
+    """List the paper's controllers that score lower here than the learned policy, cell by cell, the lowest first."""
     found = []
     for scenario, window in _windows(rows):
         for metric in METRICS:
@@ -140,14 +139,14 @@ def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> 
                     certain = pair["verdict"] != "no difference shown"
                     sentence += (
                         f"; {other} minus {learned}: {number(pair['difference'])}, 95 % {number(low)} to {number(high)}"
-                        f"{'' if certain else ', which holds 0'}"
+                        f"{'' if certain else ', which includes 0'}"
                     )
                 found.append(Loss(cell, certain, f"{sentence}."))
     return found
 
 
 def published_losses() -> list[str]:
-    """List the cells of the published table in which another controller beats its DQN."""
+    """List the cells of the paper's table in which another controller beats the DQN."""
     found = []
     for metric in METRICS:
         for scenario, window in dict.fromkeys((p.scenario, p.window) for p in TABLE_2):
@@ -169,9 +168,10 @@ def matrix(
     floor: Callable[[Row], str] | None = None,
     laws_down: bool = False,
 ) -> Table:
-    """Tabulate plants and controllers; mark each plant's lowest `ranked_by`, without the oracle.
+    """Tabulate entries, one row per plant and one column per controller; mark each plant's lowest, except the oracle.
 
-    Args: text: of a cell. floor: last column, score of the sensor's noise alone, from any controller's entry.
+    Args: text: function that formats an entry as a cell. ranked_by: key that decides the lowest. floor: function that
+      formats the score of the sensor's noise, a last column. laws_down: one row per controller, one column per plant.
     """
     laws = list(dict.fromkeys(map(law_of, entries)))
     body = []
@@ -197,7 +197,7 @@ def _mean_sd(row: Row, metric: str, scale: float) -> str:
 
 
 def scaled(row: Row, key: str, scale: float = 1.0) -> str:
-    """Format a value of a row; a dash if it is unknown."""
+    """Format a value of a row, multiplied by `scale`; a dash for an unknown value."""
     return number(None if row[key] is None else scale * row[key])
 
 
@@ -212,7 +212,7 @@ def _percent(pair: Row) -> str:
 
 
 class Measure(NamedTuple):
-    """A table of every law on every plant of a scenario. note: {n} is the number of replicates."""
+    """Table of all controllers on all plants of a scenario. Attributes as in `matrix`; `note` has a field {n}."""
 
     key: str
     title: str
@@ -228,7 +228,7 @@ SCORES = [
         metric,
         f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
         partial(_mean_sd, metric=metric, scale=scale),
-        "Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
+        "Mean ± standard deviation, n = {n}. Marked: lowest, not counting the oracle.",
         f"{metric}_mean",
         partial(scaled, key=f"floor_{metric}", scale=scale),
     )
@@ -243,22 +243,22 @@ FURTHER = [
         ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
         ("effort_ul_s", "Control effort (µL/s per decision)", False),
         ("media_ml", "Fresh medium used (mL per vial)", False),
-        ("held", "Samples on which the interlock allowed no dose, per vial", False),
+        ("held", "Samples after which the interlock allowed no dose, per vial", False),
     )
 ]
 ESTIMATES = [
     Measure(key, title, partial(scaled, key=key), "{scenario}; mean, n = {n}.")
     for key, title in (
-        ("error_2sd_pct", "Decisions in which e lay within two of its sd of the true value, %"),
-        ("share_2sd_pct", "Decisions in which s lay within two of its sd of the share at rest, %"),
+        ("error_2sd_pct", "Decisions with the true error e within 2 sd of its estimate, %"),
+        ("share_2sd_pct", "Decisions with the true growth share s within 2 sd of its estimate, %"),
         ("supervised_pct", "Decisions by the supervisor's controller, %"),
-        ("alarm_pct", "Of these, because of innovations, %"),
+        ("alarm_pct", "Decisions by the supervisor's controller because of innovations, %"),
     )
 ]
 
 
 def tables(out: Page, scenario: str, entries: Sequence[Row], *measures: Measure, laws_down: bool = False) -> None:
-    """Add the tables of one scenario, where there are entries."""
+    """Add one table per measure for a scenario, if there are entries of it."""
     known = [e for e in entries if e["scenario"] == scenario]
     for m in measures if known else ():
         note = m.note.format(n=known[0]["n"], scenario=scenario)
@@ -267,7 +267,7 @@ def tables(out: Page, scenario: str, entries: Sequence[Row], *measures: Measure,
 
 
 def every_plant(out: Page, summary: Row, scenario: str) -> None:
-    """Tables of one scenario on every plant."""
+    """Add the tables of a scenario on all plants: scores, paired differences, further measures."""
     out.add("subheading", text=scenario)
     tables(out, scenario, summary["totals"], *SCORES)
     for against, heading in (
@@ -277,20 +277,20 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     ):
         for metric in METRICS:
             chosen = [p for p in summary["paired_totals"] if p["against"] == against and p["metric"] == metric]
-            note = f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {{n}}. Where "
-            note += f"{against}'s mean is 0 the difference itself."
+            note = f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {{n}}. If "
+            note += f"{against}'s mean is 0, the cell has the difference itself."
             title = f"{heading}, {metric.upper()}, %"
             tables(out, scenario, chosen, Measure(f"{metric}_vs_{against}", title, _percent, note, folded=True))
     tables(out, scenario, summary["totals"], *FURTHER)
 
 
 def estimates(out: Page, summary: Row, scenario: str) -> None:
-    """Tabulate the uncertainty and coverage of controllers with an estimator on every plant of a scenario."""
+    """Add tables of the estimates' coverage and the supervisor's decisions in a scenario, on all plants."""
     tables(out, scenario, [e for e in summary["totals"] if ESTIMATES[0].key in e], *ESTIMATES)
 
 
 def all_rows(summary: Row) -> Table:
-    """Tabulate every row of summary.json with its details."""
+    """Build a table of all rows of summary.json with their details."""
     body = []
     for row, more in zip(summary["rows"], summary["details"], strict=True):
         body.append(
@@ -322,7 +322,7 @@ def _interval(ci: Sequence[float | None]) -> str:
 
 
 def _in_short(out: Page, summary: Row) -> None:
-    """Summarise: the learned policy and the paper's, and the lowest of every scenario and plant."""
+    """Add the summary: the learned policy beside the paper's, and the lowest controller of each scenario and plant."""
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
     for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] != "density")):
         key, _ = RANKED[str(entry["signal"])]
@@ -334,13 +334,13 @@ def _in_short(out: Page, summary: Row) -> None:
     alone = [] if items or summary["beside_paper"] else [_alone(summary, e) for e in summary["totals"] if _runs(e)]
     learned = summary["beside_paper"] and _find(beside(summary), controller="dqn")
     if items or alone or learned:
-        out.section("In short")
+        out.section("Summary")
     if learned:
         _beside_paper(out, summary)
     if items:
         out.add("verdict", claim=f"Lowest {' and '.join(unit)}, mean of the replicates:", items=items, remark="")
     if alone:
-        claim = "Mean ± standard deviation over the replicates, beside what the sensor's noise alone is given:"
+        claim = "Mean ± standard deviation over the replicates, and the score of the sensor's noise alone:"
         out.add("verdict", claim=claim, items=alone, remark="")
 
 
@@ -349,7 +349,7 @@ def _runs(entry: Row) -> bool:
 
 
 def _alone(summary: Row, entry: Row) -> str:
-    """Describe a single controller: its score, the oracle's if it was run, and the sensor's noise."""
+    """Return the scores of a controller, of the oracle if it was run, and of the sensor's noise, as text."""
     oracle = _find(summary["totals"], controller="oracle", plant=entry["plant"], scenario=entry["scenario"])
     scores = []
     for metric in METRICS:
@@ -360,7 +360,7 @@ def _alone(summary: Row, entry: Row) -> str:
 
 
 def _first(laws: Mapping[str, Sequence[float]]) -> str:
-    """Name the lowest controller and the next one, by the mean of their values."""
+    """Return the two controllers with the lowest means, as text. Args: laws: controller -> its values."""
     means = {law: sum(values) / len(values) for law, values in laws.items()}
     (law, value), (other, beyond), *_ = sorted(means.items(), key=lambda item: item[1])
     return f"{law} {number(value)}, then {other} {number(beyond)}"
@@ -373,13 +373,13 @@ def _beside_paper(out: Page, summary: Row) -> None:
     certain = len({loss.cell for loss in lost if loss.certain})
     if lost:
         claim = (
-            f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them for certain "
-            "(the 95 % interval of the paired difference is above 0):"
+            f"Here the learned policy (dqn) loses {cells_lost} of {cells} cells, {certain} of them significantly "
+            "(95 % interval of the paired difference without 0):"
         )
     else:
-        claim = f"The learned policy (dqn) is lowest in all {cells} cells here."
+        claim = f"Here the learned policy (dqn) is lowest in all {cells} cells."
     theirs = published_losses()
-    remark = f"In the published table the DQN loses {len(theirs)} of 10: {', '.join(theirs)}."
+    remark = f"In the paper's table the DQN loses {len(theirs)} of 10 cells: {', '.join(theirs)}."
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
 
 
@@ -398,14 +398,14 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
     for name, entry in summary["agents"].items():
         regret = entry["regret_pct"]
         shown = ", ".join(number(r) for r in regret) if isinstance(regret, list) else number(regret)
-        out.text(f"{name}: regret against the optimum of the model, % per seed: {shown}.")
+        out.text(f"{name}: regret against the model's optimum, %, one value per seed: {shown}.")
     for f in first:
         if (run / f["file"]).is_file():
             out.figure(run / f["file"], f["title"], f["caption"])
 
 
 def _density(out: Page, summary: Row, run: Path) -> None:
-    """Add the paper's table, the figures, every plant."""
+    """Add the sections of the density: the paper's Table 2, the figures, all plants, the estimates."""
     if summary["beside_paper"]:
         out.section("The paper's Table 2 beside this run")
         for metric in METRICS:
@@ -416,8 +416,8 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         out.section("Figures")
         if regulated is not None:
             out.text(
-                f"Settling at 0.5 from 0.7: {number(regulated['settling_min'])} min (median of {regulated['n']}; "
-                f"paper: {summary['paper_settling_min']:g} min on average, start and band not stated)."
+                f"Settling time from 0.7 to 0.5: {number(regulated['settling_min'])} min (median of {regulated['n']} "
+                f"replicates; paper: {summary['paper_settling_min']:g} min on average, start and band not stated)."
             )
         for f in rest:
             out.figure(run / f["file"], f["title"], f["caption"])
@@ -429,20 +429,20 @@ def _density(out: Page, summary: Row, run: Path) -> None:
     if wide:
         out.section("Every plant")
         out.text(
-            "Model-based controllers and the learned policy use the model of the configuration (env) "
-            "on every plant; the configuration below describes each plant."
+            "On every plant, model-based controllers and the learned policy use the model of the configuration (env). "
+            "The configuration below describes each plant."
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
     estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0].key in e)
     if estimated:
-        out.section("How sure the estimates were, and what the supervisor did")
+        out.section("Coverage of the estimates, and decisions of the supervisor")
         for scenario in estimated:
             estimates(out, summary, scenario)
 
 
 class Section(NamedTuple):
-    """Part of the page for a signal: title, function that adds the sections, and their terms."""
+    """Part of the page for a signal. title: of the page. add: adds the sections. definitions: term -> its meaning."""
 
     title: str
     add: Callable[[Page, Row, Path], None]
@@ -472,6 +472,6 @@ def of_benchmark(run: Path) -> Page:
     if summary["details"]:
         out.section("All numbers")
         out.table(all_rows(summary), folded=f"{count(len(summary['details']), 'row')}; also in tables/rows.csv")
-    out.section("What was run")
+    out.section("Command and configuration")
     provenance(out, run)
     return out

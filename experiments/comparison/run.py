@@ -1,4 +1,4 @@
-"""A benchmark from its checked config to its page: train, run every closed loop, compare, draw, report."""
+"""Run a benchmark: train, run the closed loops, compare the controllers, write figures and page."""
 
 import json
 import logging
@@ -28,15 +28,15 @@ from experiments.training.config import TrainConfig
 log = logging.getLogger(__name__)
 
 COMPLETED: list[Callable[[BenchmarkConfig], BenchmarkConfig]] = []
-"""What guests fill in."""
+"""Functions of guests that complete a benchmark's config."""
 FOLLOWED: dict[str, Callable[[BenchmarkConfig, Iterable[str], Path], Mapping[str, Followed | None]]] = {}
-"""Signal of a guest -> what each of its laws follows, if anything; the run folder keeps copies."""
+"""Signal of a guest -> function that returns each controller's policy or None, and copies it into the run folder."""
 
 
 def learned(
     config: BenchmarkConfig, wanted: set[str], folder: Path
 ) -> tuple[dict[str, Followed], dict[str, Any], list[dict[str, str]]]:
-    """Return the policies of the learned controllers, their origins, and the figures of those trained here."""
+    """Load or train the policies of learned controllers; return policies, their origin and scores, and figures."""
     found: dict[str, Followed] = {}
     agents: dict[str, Any] = {}
     figures = []
@@ -65,8 +65,8 @@ def learned(
         at = summary["seeds"].index(summary["policy_seed"])
         caption = (
             f"{config.train_seeds} seeds of {summary['env_steps']} environment steps each, 100 per episode. "
-            f"Bands over seeds: range and middle half. The policy used here is that of seed {summary['policy_seed']}, "
-            f"best on the selection grid: regret {summary['regret_pct'][at]:.2f} % on the reported grid."
+            f"Bands: range and middle half of the seeds. Policy used: seed {summary['policy_seed']}, the best on the "
+            f"selection grid; its regret on the reported grid is {summary['regret_pct'][at]:.2f} %."
         )
         title = f"Training of {name} (the paper's Fig. 2b)"
         figures.append({"file": f"training/{name}/figures/learning.svg", "title": title, "caption": caption})
@@ -74,7 +74,7 @@ def learned(
 
 
 def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
-    """Write every trajectory as `scenario/plant/controller/od` etc., shape (N, K), to trajectories.npz."""
+    """Write all trajectories to trajectories.npz: arrays SCENARIO/PLANT/CONTROLLER/od and so on, shape (N, K)."""
     arrays = {
         f"{t.cell.scenario}/{t.cell.plant}/{t.cell.controller}/{key}": getattr(t, key).astype(np.float32)
         for t in trials
@@ -84,7 +84,7 @@ def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
 
 
 def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Add the plant of `plant_file`; its vials start anywhere in the recording, at the OD of all other plants.
+    """Add the plant of `plant_file`. Its vials start at a random time of the recording, at the OD of the other plants.
 
     Raises: frame.UserError.
     """
@@ -97,11 +97,11 @@ def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Add a controller per seed if `policies` has several. Raises: frame.UserError."""
+    """Replace a learned controller whose policy is a folder of seeds by one per seed. Raises: frame.UserError."""
     for name, where in config.policies.items():
         if name not in config.controllers or config.controllers[name].kind != "dqn":
             known = [n for n, c in config.controllers.items() if c.kind == "dqn"]
-            raise frame.UserError(f"policies.{name}: no learned controller; allowed {', '.join(known)}")
+            raise frame.UserError(f"policies.{name}: not a learned controller; use one of {', '.join(known)}")
         seeds = {f"{name}_{path.stem}": path for path in sorted(Path(where).glob("seed*.npz"))}
         if not seeds:
             continue
@@ -116,7 +116,7 @@ def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
-    """Calibrate, train, run every closed loop, compare, draw, report."""
+    """Run a benchmark and write its output files into a folder."""
     guests.load("experiments.comparison")
     for completed in COMPLETED:
         config = completed(config)

@@ -1,4 +1,4 @@
-"""Statistics of trials: means with intervals, and paired differences between controllers on the same draws."""
+"""Statistics of trials: means with intervals, and paired differences between controllers on the same vials."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,9 +19,9 @@ NEGLIGIBLE = 1e-6  # smallest mean for a difference in percent
 
 
 class Spread:
-    """Mean, median and standard deviation over replicates, 95 % intervals of mean (Student's) and median, without nan.
+    """Mean, median and standard deviation over replicates; 95 % intervals of the mean (Student's t) and the median.
 
-    With one replicate there is no deviation and no interval (nan).
+    Replicates with value nan are ignored. With a single replicate the standard deviation and the intervals are nan.
     """
 
     def __init__(self, values: Array) -> None:
@@ -31,7 +31,7 @@ class Spread:
         self.mean = float(finite.mean()) if self.n else float("nan")
         self.median = float(np.median(finite)) if self.n else float("nan")
         self.sd = float(finite.std(ddof=1)) if self.n > 1 else float("nan")
-        # of the median of any distribution: order statistics, by the binomial of a sign test
+        # interval of the median from order statistics (sign test); valid for every distribution
         ordered, below = np.sort(finite), int(binom.ppf(0.025, self.n, 0.5)) if self.n else 0
         self.median_ci95 = [float(ordered[below - 1]), float(ordered[-below])] if below else [float("nan")] * 2
         half = float(student.ppf(0.975, self.n - 1)) * self.sd / self.n**0.5 if self.n > 1 else float("nan")
@@ -39,13 +39,13 @@ class Spread:
 
     @property
     def sign(self) -> int:
-        """-1 or 1 if the interval excludes zero, else 0. Without any spread the sign of the mean."""
+        """Sign of the mean if its 95 % interval excludes zero, else 0."""
         low, high = self.ci95
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
 
 
 def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
-    """Build one row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
+    """Build a row of summary.json: metrics of the measured OD (T = 1 min), means; the settling time is a median."""
     score = trial.score(window)
     of = {metric: Spread(getattr(score, metric)) for metric in METRICS}
     columns = [(m, part) for parts in (("mean", "sd"), ("median",), ("ci95",)) for m in METRICS for part in parts]
@@ -70,11 +70,11 @@ def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
     "density": lambda trial: [row(trial, window) for window in windows(trial.schedule)],
 }
-"""Signal -> the rows of one of its trials; a guest adds its own."""
+"""Signal -> function that builds the rows of a trial; a guest adds its own signal."""
 
 
 def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
-    """List further values, an entry per row: the other convention, the noise-free OD, the floor, the effort."""
+    """List further values per row: scores with T = window, of the noise-free OD and of the noise; control effort."""
     return [_detail(trial, window) for trial in trials for window in windows(trial.schedule)]
 
 
@@ -104,7 +104,7 @@ def _total(trial: DensityTrial, metric: str, of: str = "measured") -> Array:
 
 
 def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
-    """Build one entry per trial: ISE and ITAE summed over its windows, medium and pump moves."""
+    """Build one entry per trial: ISE and ITAE summed over its windows, medium used, control effort and so on."""
     found = []
     for trial in trials:
         entry = trial.names() | {"n": int(trial.od.shape[0])}
@@ -143,7 +143,7 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
 
 
 Scored = list[tuple[str, str, Array]]
-"""Window, metric and its value in each replicate, (N,)."""
+"""List of (window, metric, the metric's value in each replicate, (N,))."""
 
 
 def _density_scores(trial: DensityTrial) -> Scored:
@@ -154,13 +154,14 @@ def _density_scores(trial: DensityTrial) -> Scored:
 SCORES: dict[str, Callable[[Any], Scored]] = {
     "density": _density_scores,
 }
-"""Signal -> what laws are compared by, reactor by reactor; a guest adds its own."""
+"""Signal -> function that returns the scores by which controllers are compared; a guest adds its own signal."""
 
 
 def pairs(trials: Sequence[Trial], against: str, scores: Callable[[Any], Scored] | None = None) -> list[dict[str, Any]]:
-    """Compare every controller with `against` on the same vials, window by window, or by other scores.
+    """Compare every controller with the controller `against` on the same vials, window by window.
 
-    Returns: mean difference over replicates with its 95 % interval, and the number of replicates in which it is lower.
+    Args: scores: function that returns other scores to compare. Returns: per comparison, the mean difference over
+    replicates with its 95 % interval, and the number of replicates in which the controller scores lower.
     """
     found = []
     of = {t.cell.vials: t for t in trials if t.cell.controller == against}

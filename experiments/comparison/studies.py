@@ -1,4 +1,4 @@
-"""Studies of a benchmark: calibration, figures of the closed loops, summary.json."""
+"""Results of a benchmark: simulated calibration, figures of the closed loops, summary.json."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -21,13 +21,13 @@ CAPTIONS = {
     "comparison": "Controllers side by side at 0.5 (the paper's Fig. 4)",
 }
 AGAINST: dict[str, tuple[str, ...]] = {"density": ("dqn", "dqn_adaptive", "oracle")}
-"""Signal -> the laws that the others are compared with, replicate by replicate; a guest adds its own."""
+"""Signal -> reference controllers of the paired comparisons; a guest adds its own signal."""
 DRAWN: dict[str, Callable[[Sequence[Any], Sequence[dict[str, Any]]], Iterator["Drawing"]]] = {}
-"""Signal of a guest -> what draws its trials, by their rows, too."""
+"""Signal of a guest -> function that draws figures from its trials and from their rows of summary.json."""
 
 
 class Drawing(NamedTuple):
-    """A figure, the name of its file, and its title and caption on the page."""
+    """Figure with the name of its file, and its title and caption on the page."""
 
     name: str
     figure: Figure
@@ -36,7 +36,7 @@ class Drawing(NamedTuple):
 
 
 def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
-    """Run the open-loop protocol on the training model with 1 % noise, and fit it.
+    """Simulate the paper's open-loop protocol on the training model, and fit the recording; return numbers and figure.
 
     Raises: ValueError if the fit fails.
     """
@@ -55,14 +55,14 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
         "fig2a_calibration",
         fit_figure(raw, result, "open-loop recording and free-running model"),
         "Calibration (the paper's Fig. 2a)",
-        f"One simulated open-loop recording of {protocol.hours:g} h, {100 * protocol.noise:g} % sensor noise, and the "
-        f"model fitted to it, run freely from one start. PMSE {result.pmse_pct:.2g} % (paper: 6 % on a real "
-        "recording).",
+        f"One simulated open-loop recording of {protocol.hours:g} h with {100 * protocol.noise:g} % sensor noise, and "
+        f"the fitted model, simulated from the start without feedback. PMSE {result.pmse_pct:.2g} % (paper: 6 % on a "
+        "real recording).",
     )
 
 
 def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
-    """Draw the figures of the studies, from the trials and from the numbers of `summarise`."""
+    """Draw the figures of the studies. Args: summary: as `summarise` returns it."""
     for signal, drawn in DRAWN.items():
         yield from drawn([t for t in trials if t.cell.signal == signal], summary["rows"])
     yield from _closed_loops(config, [t for t in trials if isinstance(t, DensityTrial)])
@@ -83,8 +83,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             figures.plants(totals),
             f"Every plant, {scenario}",
             f"ISE and ITAE of the measured OD, summed over the windows; mean and 95 % interval, n = "
-            f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the "
-            "setpoint. The controller hold is off the scale and left out.",
+            f"{config.replicates}. Red: score of the sensor's noise alone, for a culture exactly on the setpoint. "
+            "The controller `hold` is not drawn, because its values are far larger.",
         )
         learned = "dqn_adaptive" if any(e["controller"] == "dqn_adaptive" for e in totals) else "dqn"
         against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == learned]
@@ -95,12 +95,12 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
                 f"Difference to {learned}, {scenario}",
                 f"Paired over {config.replicates} replicates with the same vials, pumps and noise: mean and 95 % "
                 f"interval, in % of {learned}'s mean. Left of zero: better than {learned}. "
-                "The controller hold is off the scale and left out.",
+                "The controller `hold` is not drawn, because its values are far larger.",
             )
 
 
 def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> Iterator[Drawing]:
-    """Draw OD and pump rate of the paper's studies and of studies with a single scenario and plant."""
+    """Draw OD and pump rate for the paper's studies, and for studies with only one scenario and plant."""
     by_cell = {(t.cell.controller, t.cell.plant, t.cell.scenario): t for t in trials}
     for name, study in config.studies.items():
         several = len(study.plants) * len(study.scenarios) > 1
@@ -117,13 +117,13 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
                     f"{name}_{scenario}_{plant}" if several or name not in CAPTIONS else name,
                     figures.bands(shown),
                     CAPTIONS.get(name, f"{name}: {scenario} on {plant}"),
-                    f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard "
-                    "deviation over replicates; dashed: setpoint.",
+                    f"Plant {plant}, {config.replicates} replicates. Line: mean over replicates of {what}; band: ± one "
+                    "standard deviation; dashed: setpoint.",
                 )
 
 
 def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[dict[str, Any]]:
-    """List the rows beside the paper's table: first plant of the studies with the scenarios' names."""
+    """List the rows that correspond to the paper's Table 2: its two studies, each on its first plant."""
     shown = []
     for name in ("setpoint_steps", "temperature_switch"):
         if name in config.studies and config.studies[name].plants:
@@ -137,7 +137,7 @@ def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[d
 
 
 def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
-    """Build all numbers of the closed loops, and the paper's."""
+    """Build summary.json from the trials: the numbers of all closed loops, and those of the paper."""
     plants, controllers = list(config.plants), list(config.controllers)
     density = [t for t in trials if isinstance(t, DensityTrial)]
     ordered = sorted(density, key=lambda t: (plants.index(t.cell.plant), controllers.index(t.cell.controller)))

@@ -1,7 +1,7 @@
 """Closed loops to compare: a controller on a plant in a scenario, all replicates as a single batch.
 
-A loop has a signal: what the law holds on its setpoint, the `density` by the pump or what a guest brings. `Loops` runs
-those that the studies of a benchmark need, in processes of their own.
+The signal of a loop is the quantity that its controller holds: the `density`, or a signal that a guest adds. `Loops`
+runs the loops of a benchmark in parallel processes.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 SUPERVISED = ("supervised", "alarm")
-LEAST_NOISE = 1e-9  # OD, of a sensor without noise
+LEAST_NOISE = 1e-9  # noise given to a sensor without noise, OD
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One closed loop: names of controller, plant, scenario and controlled signal."""
+    """Names that identify a closed loop: controller, plant, scenario and controlled signal."""
 
     controller: str
     plant: str
@@ -57,13 +57,13 @@ class Cell:
 
     @property
     def vials(self) -> tuple[object, ...]:
-        """What loops that meet the same draws have in common."""
+        """Key of the simulated vials: loops with an equal key have identical vials and noise."""
         return self.signal, self.plant, self.scenario
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Recording of N replicates since the start of the schedule; minute (K,), temperature of the vial (N, K)."""
+    """Recorded closed loop of N replicates. minute: of the schedule, (K,). temperature: of the vials, degC, (N, K)."""
 
     cell: Cell
     schedule: Scenario
@@ -71,13 +71,13 @@ class Trial:
     temperature: Array
 
     def names(self) -> dict[str, Any]:
-        """Say in a row of summary.json what was run."""
+        """Return the entries of a row of summary.json that identify the trial."""
         return {key: getattr(self.cell, key) for key in ("signal", "controller", "plant", "scenario")}
 
 
 @dataclass(frozen=True)
 class Window:
-    """A phase of a schedule, named by its setpoint, temperature (degC) or hours, whichever differs."""
+    """Phase of a schedule. label: setpoint, temperature or hours. start, end: minutes of the schedule."""
 
     label: str
     setpoint: float
@@ -86,7 +86,7 @@ class Window:
 
 
 def windows(schedule: Scenario) -> list[Window]:
-    """List the phases of a schedule with their names."""
+    """List the phases of a schedule, labelled by setpoint, temperature or hours: the first that differs in all."""
     edges = schedule.edges
     by_setpoint = [f"{s:g}" for s in schedule.setpoints]
     by_temperature = [f"{t:g}" for t in schedule.temperatures]
@@ -100,13 +100,13 @@ def windows(schedule: Scenario) -> list[Window]:
 
 @dataclass(frozen=True, eq=False)
 class DensityTrial(Trial):
-    """Trial of a density; arrays (N, K).
+    """Trial of a density controller; arrays (N, K) unless stated.
 
-    od: as measured. clean: reading of a noise-free sensor. rate: mL/s after the interlock.
-    media_ml: fresh medium delivered since the culture began.
-    held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
-    told: for a controller with an estimator, fractions of its decisions, (N,) each: by its supervisor, under an
-    innovation alarm, and with an estimate within two of its sd of the true value, by the estimate's name.
+    od: measured OD. clean: reading of a noise-free sensor. rate: pump rate after the interlock, mL/s.
+    media_ml: fresh medium delivered so far. held: number of samples after which the interlock allowed no dose, (N,).
+    overflowed: whether the vessel has overflowed, (N,).
+    told: for a controller with an estimator, fractions of its decisions, (N,) each: `supervised` (by the supervisor),
+    `alarm` (because of innovations), and NAME of an estimate (the true value is within two standard deviations).
     """
 
     od: Array
@@ -120,8 +120,8 @@ class DensityTrial(Trial):
     def score(self, window: Window, of: str = "measured") -> WindowMetrics:
         """Compute the metrics of a window.
 
-        Args: of: `measured`, the OD as in the paper; `clean`, the noise-free OD; `floor`, the error of the sensor
-        alone, i.e. the score of a culture exactly on the setpoint.
+        Args: of: `measured` for the measured OD, as in the paper; `clean` for the noise-free OD; `floor` for the
+        sensor's error alone, that is the score of a culture exactly on the setpoint.
         """
         od = {"measured": self.od, "clean": self.clean, "floor": self.od - self.clean}[of]
         setpoint = 0.0 if of == "floor" else window.setpoint
@@ -146,14 +146,14 @@ def closed(
     seed: int,
     make: Callable[[Plant, Bench], tuple[Controller, Sequence[Signal], SafetyConfig]],
 ) -> tuple[ClosedLoop, Plant]:
-    """Close a loop around N replicates, named M0, M1, ..., as one batch.
+    """Build the closed loop of N replicates, named M0, M1, ..., as one batch; return it and the plant.
 
-    The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
+    The seed determines the plant, so every controller has the same vials, pumps, sensors and noise.
 
-    Args: model: control period and largest pump rate, the interlock's limit. make: function of the vials and their
-    bench; returns the density controller, further signals, and the interlock's limits.
+    Args: model: sets the control period and the largest pump rate. make: function (plant, bench) that returns the
+    density controller, further signals, and the interlock's limits.
     """
-    if plant_config.sensor.noise_floor == 0.0:  # the interlock treats a sensor that repeats exactly as dead
+    if plant_config.sensor.noise_floor == 0.0:  # the interlock regards a sensor with equal readings as frozen
         plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
     bench = Bench(period_s=60.0 * model.control_min, max_rate=model.max_pump_rate)
     plant = Plant(plant_config, replicates, np.random.default_rng(seed), bench.volume_ml)
@@ -169,7 +169,7 @@ def closed(
 
 
 def record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
-    """Run a loop to its end; return the minutes of its schedule, (K,), and the values at each, (N, K) by name."""
+    """Run a loop; return minutes of its schedule, (K,), and values, name -> (N, K). Args: seen: values of a step."""
     schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
     minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
     stored: dict[str, Array] = {}
@@ -192,7 +192,7 @@ def run_trial(
 ) -> DensityTrial:
     """Run N replicates of a density loop.
 
-    Args: cell: its names. make: builds the controller for a plant. The others: of `_closed`.
+    Args: cell: names of the loop. make: builds the controller for a plant. The other arguments as in `closed`.
     """
     loop, plant = closed(
         plant_config, schedule, model, replicates, seed, lambda vials, _: (make(vials), (), SafetyConfig())
@@ -222,11 +222,11 @@ def run_trial(
 
 Split = Callable[[StudyConfig, Cell], Sequence[Cell]]
 SPLITS: list[Split] = []
-"""Of a study, and a cell of it that holds a density, the cells that are run in its place; a guest adds its own."""
+"""Functions (study, density cell) of guests that return the cells to run instead; empty: run the density cell."""
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:
-    """List every closed loop of the studies once, in order."""
+    """List the closed loops of all studies, each once, in order."""
     wanted: dict[Cell, None] = {}
     for study in config.studies.values():
         for scenario in study.scenarios:
@@ -239,7 +239,7 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
 
 
 Followed = tuple[Policy, EstimateBounds | None]
-"""A policy, and the estimator's error bounds of its certificate."""
+"""A policy, and the bounds on estimation errors from its certificate."""
 
 
 def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
@@ -252,20 +252,19 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
 
 Run = Callable[[BenchmarkConfig, Any, Followed | None], Trial]
 RUNS: dict[str, Run] = {"density": _density}
-"""Signal -> what runs one of its loops; a guest adds its own."""
+"""Signal -> function that runs a loop of it; a guest adds its own signal."""
 
 
 def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
-    """Run one closed loop of a benchmark; it depends only on its arguments, so every process gives the same."""
+    """Run one closed loop of a benchmark. The result depends only on the arguments, not on the process."""
     guests.load("experiments.comparison")
     return RUNS[cell.signal](config, cell, followed)
 
 
 class Loops(ExitStack):
-    """Runner of cells in separate processes, one per core, from `start` on.
+    """Runner of closed loops in `config.workers` processes; 0: one per core, 1: no process but this one.
 
-    Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
-    A context: its end cancels waiting cells, an exception also running ones.
+    Use it as a context manager: at its end it cancels waiting loops, and after an exception also running ones.
     """
 
     def __init__(self, config: BenchmarkConfig) -> None:
@@ -276,7 +275,7 @@ class Loops(ExitStack):
         self._pool = self.enter_context(Workers(config.workers)) if config.workers != 1 else None
 
     def start(self, cells: Sequence[Cell], followed: Followed | None = None) -> None:
-        """Queue cells that all follow one policy, or none."""
+        """Queue cells; `followed` is the policy that all of them use, None for controllers without one."""
         for cell in cells:
             if self._pool is None:
                 self._waiting[cell] = followed
@@ -284,14 +283,14 @@ class Loops(ExitStack):
                 self._running[self._pool.submit(run_cell, self.config, cell, followed)] = cell
 
     def _finished(self) -> Iterator[tuple[Cell, Trial]]:
-        """Yield every cell with its trial, as they finish."""
+        """Yield each cell with its trial as soon as the trial has finished."""
         for cell, followed in self._waiting.items():
             yield cell, run_cell(self.config, cell, followed)
         for future in as_completed(self._running):
             yield self._running[future], future.result()
 
     def results(self) -> dict[Cell, Trial]:
-        """Wait for all trials; a bar on a terminal, ten lines in a log."""
+        """Wait for all trials and return them; show a progress bar on a terminal, or about ten lines in a log."""
         total, trials = len(self._waiting) + len(self._running), {}
         with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
             for k, (cell, trial) in enumerate(self._finished(), 1):

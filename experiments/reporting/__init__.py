@@ -1,3 +1,3 @@
 """Charts, tables, pages, TensorBoard: files from arrays and dictionaries.
 
-Commands and other rooms import it; it imports no other room of the experiments."""
+Commands and other packages import it; it imports only `experiments.cli` of the experiments."""

@@ -20,11 +20,11 @@ ESTIMATOR, MARK = PUMP, REJECTED
 
 
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
-    """Draw measured OD with the model of the returned method, its errors below, and the pump rate.
+    """Draw three charts: measured OD with the fitted model, the model's errors, and the pump rate.
 
-    prediction_error: the OD predicted from earlier readings and the pump, and the innovations in their sd; free_run:
-    the free trajectory and its residuals. A thin line is the free run of the other pair.
-    Args: raw: the recording before screening, at the same positions as `result`'s. result: of `calibrate`.
+    Method prediction_error: one-step predictions and innovations; a dashed line shows the free run of the same pair.
+    Method free_run: the simulation without feedback from readings, and its residuals.
+    Args: raw: the recording before screening, with the same rows as in `result`. result: as `calibrate` returns.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
     top, middle, bottom = axes
@@ -56,14 +56,14 @@ def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
 
 
 def _innovations(ax: Axes, hours: Array, innovation: Array, correlation: float) -> None:
-    """Draw the innovation of each reading; two in three lie within 1 sd, 95 % within the band."""
+    """Draw innovations in predicted standard deviations; for a correct model 95 % lie in the shaded band."""
     ax.axhspan(-1.96, 1.96, color=MODEL, alpha=0.08, lw=0)
     ax.axhline(0.0, color="0.6", lw=0.8)
     ax.plot(hours, innovation, ".", ms=3, color=DATA)
     ax.set_ylabel("innovation,\npredicted sd")
     inside = 100.0 * float(np.mean(np.abs(innovation[np.isfinite(innovation)]) < 1.96))
     ax.set_title(
-        f"one-step innovations: {inside:.0f} % in the 95 % band, correlation from row to row {correlation:.2f}"
+        f"one-step innovations: {inside:.0f} % in the 95 % band, correlation of consecutive rows {correlation:.2f}"
     )
 
 
@@ -74,7 +74,7 @@ def _model_label(result: Calibration) -> str:
 
 
 def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
-    """Draw used and rejected readings; those beyond the scale are triangles on the upper edge."""
+    """Draw used and rejected readings; a triangle on the upper edge marks a rejected reading beyond the scale."""
     hours, clean = raw.time / 60, result.screened.series.od
     a, b = result.window
     window = np.zeros(len(hours), dtype=np.bool_)
@@ -98,7 +98,7 @@ def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
 
 
 def drift_figure(result: Calibration, title: str) -> Figure:
-    """Draw mu and tau of each separately fitted segment, the returned pair and its window."""
+    """Draw mu and tau over time: the estimate of each segment, and the returned pair over its window."""
     figure, axes = new_figure(9.5, 6.2, 2, sharex=True)
     time = result.screened.series.time / 60
     a, b = result.window
@@ -123,7 +123,7 @@ def drift_figure(result: Calibration, title: str) -> Figure:
 
 
 def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list[Parameter | None]) -> list[float]:
-    """Draw the estimates with their intervals; return the middles (h) of segments with an estimate."""
+    """Draw the segments' estimates and intervals; return the middle time, h, of each segment with an estimate."""
     spans = [(s.middle_min / 60, 0.5 * (time[s.end - 1] - time[s.first])) for s in segments]
     middle, value, low, high = _alone(ax, spans, values)
     if len(middle):
@@ -132,14 +132,14 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         least, most = value.min() - 1.1 * down - margin, value.max() + 1.1 * up + margin
         ax.set_ylim(
             least, most + 0.2 * (most - least)
-        )  # one wide interval must not flatten the rest; a legend has room
+        )  # clip a very wide interval, so that the others stay visible; leave space for the legend
     return [float(m) for m in middle]
 
 
 def _alone(ax: Axes, spans: Sequence[tuple[float, float]], found: Sequence[Parameter | None]) -> Array:
-    """Draw the estimate of each segment, fitted alone; return middle (h), value, low and high of those known, (4, K).
+    """Draw the estimates of separately fitted segments; return middle time (h), value, low, high of each, (4, K).
 
-    Args: spans: middle and half length of each segment, h.
+    Args: spans: middle and half length of each segment, h. found: its estimate; None, if it has none, is not drawn.
     """
     known = [(*span, p.value, p.low, p.high) for span, p in zip(spans, found, strict=True) if p is not None]
     middle, across, value, low, high = np.array(known).reshape(-1, 5).T
@@ -153,24 +153,24 @@ def _alone(ax: Axes, spans: Sequence[tuple[float, float]], found: Sequence[Param
 
 
 def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: str) -> Figure:
-    """Draw intervals of many simulated recordings and the true value, sorted by estimate; misses in colour.
+    """Draw 95 % intervals of N simulated recordings, sorted by estimate; colour marks intervals without the true value.
 
-    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: of mu and of tau, shape (N,) each.
+    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: true mu and true tau, shape (N,) each.
     """
     figure, axes = new_figure(10.5, 4.6, 1, 2)
     figure.suptitle(title, fontsize=10)
-    names = (("growth rate µ over its truth", mu, truth[0]), ("dilution constant τ over its truth", tau, truth[1]))
+    names = (("growth rate µ / true value", mu, truth[0]), ("dilution constant τ / true value", tau, truth[1]))
     for ax, (label, data, true) in zip(axes, names, strict=True):
         data = data / true[:, None]
         data = data[np.argsort(data[:, 0])]
         hit = (data[:, 1] <= 1.0) & (data[:, 2] >= 1.0)
-        for mask, colour, name in ((hit, DATA, "holds the truth"), (~hit, MODEL, "misses it")):
+        for mask, colour, name in ((hit, DATA, "with true value"), (~hit, MODEL, "without true value")):
             ax.vlines(
                 np.flatnonzero(mask), data[mask, 1], data[mask, 2], color=colour, lw=1.0,
                 label=f"95 % interval {name}: {mask.sum()} of {len(mask)}",
             )  # fmt: skip
         ax.plot(data[:, 0], ".", ms=2.5, color="black", label="estimate")
-        ax.axhline(1.0, color=PUMP, lw=1.3, label="truth")
+        ax.axhline(1.0, color=PUMP, lw=1.3, label="true value")
         ax.set_ylabel(label)
         ax.set_xlabel("simulated recording, sorted by estimate")
         low, high = ax.get_ylim()
@@ -180,9 +180,9 @@ def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: st
 
 
 def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> Figure:
-    """Draw mu(t) and tau(t) of the twin with 95 % bands, above the trustworthy readings.
+    """Draw three charts over time: mu and tau of the twin with 95 % bands, and the readings that were not rejected.
 
-    Args: raw, result: as `fit_figure`. behind: the twin.
+    Args: raw, result: as in `fit_figure`. behind: the twin.
     """
     figure, axes = new_figure(9.5, 7.2, 3, sharex=True, height_ratios=(1.2, 1.2, 1.0))
     clean, (a, b) = result.screened.series, result.window
@@ -193,7 +193,7 @@ def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> F
         ("dilution constant τ", behind.tau, [s.tau for s in result.segments], result.tau),
     )
     for ax, (label, course, values, pair) in zip(axes, rows, strict=False):
-        ax.fill_between(hours, course.low, course.high, color=MODEL, alpha=0.18, lw=0, label="its 95 % band")
+        ax.fill_between(hours, course.low, course.high, color=MODEL, alpha=0.18, lw=0, label="twin's 95 % band")
         ax.plot(hours, course.value, "o-", ms=4, color=MODEL, lw=1.6, label="twin")
         ax.plot(raw.time[[a, b - 1]] / 60, [pair.value] * 2, color="0.35", lw=1.0, ls="--", label="returned pair")
         known = [(s.middle_min / 60, v.value) for s, v in zip(result.segments, values, strict=True) if v is not None]
@@ -215,10 +215,10 @@ def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> F
 
 
 def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervised: Array, title: str) -> Figure:
-    """Draw growth rate and pump gain of the recording, the model's values, and the errors of its predictions.
+    """Compare a recording with its model in three charts: growth rate, pump gain, and errors of one-step predictions.
 
-    Args: estimator: the controller's estimates: `minute`, and `mu` (1/min) or `gain` if it has one, all (K,).
-      supervised: minutes at which a supervisor acted, (S,).
+    Args: estimator: the controller's estimates, (K,): `minute`; `mu` (1/min) and `gain`, where it estimates them.
+      supervised: minutes at which the supervisor acted, (S,).
     """
     figure, axes = new_figure(9.5, 7.4, 3, sharex=True, height_ratios=(1.2, 1.2, 1.0))
     top, middle, bottom = axes
@@ -228,7 +228,7 @@ def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervise
     ]
     for first, end, band in zip(found.net.first_min, found.net.end_min, net, strict=True):
         if band is not None:
-            label = "if the pump is the model's" if first == found.net.first_min[0] else None
+            label = "if the pump gain is 1" if first == found.net.first_min[0] else None
             top.fill_between([first / 60, end / 60], *band, color=MODEL, alpha=0.25, lw=0, label=label)
     _compared(middle, found.gain, "pump gain, 1 = the model's")
     for ax, key in ((top, "mu"), (middle, "gain")):
@@ -248,19 +248,19 @@ def agreement_figure(found: Agreement, estimator: Mapping[str, Array], supervise
     top.set_title(title)
     bottom.set_ylabel("measured minus\npredicted, OD")
     bottom.set_title(
-        f"one sample ahead: rms {found.rms:.4f} OD, {found.attainable:.4f} without the model's error of net growth"
+        f"error of one-step predictions: rms {found.rms:.4f} OD, {found.attainable:.4f} with the correct net growth"
     )
     bottom.set_xlabel("time, h")
     return figure
 
 
 def _compared(ax: Axes, c: Compared, label: str) -> None:
-    """Draw a parameter's segments with their intervals over the model's value."""
+    """Draw a parameter's estimate and interval in each segment, and the model's value as a line."""
     ax.axhline(c.expected, color="black", lw=1.0, ls="--", label="model")
     spans = [((a + b) / 120, (b - a) / 120) for a, b in zip(c.first_min, c.end_min, strict=True)]
     middle, value, low, high = _alone(ax, spans, c.found)
     if len(middle):
         ends = np.append(value, c.expected)
         spread = max(1.5 * float(np.ptp(ends)), 2.0 * float(np.median(high - low)), 0.1 * c.expected)
-        ax.set_ylim(max(ends.mean() - spread, 0.0), ends.mean() + spread)  # one wide interval must not flatten the rest
+        ax.set_ylim(max(ends.mean() - spread, 0.0), ends.mean() + spread)  # clip very wide intervals
     ax.set_ylabel(label)

@@ -1,4 +1,4 @@
-"""The one style of all figures, and the figures of training, deployment and speed.
+"""The style of all figures, and the figures of training and deployment.
 
 Each function takes arrays and returns a matplotlib Figure; `save` writes it as SVG and PNG.
 """
@@ -42,40 +42,40 @@ matplotlib.rcParams.update(
 def new_figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **kwargs: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Create a figure and its axes, row by row; `kwargs` go to `Figure.subplots`."""
+    """Create a figure and return its axes, row by row; `kwargs` are passed to `Figure.subplots`."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
 
 
 def save(figure: Figure, folder: Path, name: str) -> Path:
-    """Write folder/name.svg and folder/name.png; returns the path of the PNG."""
+    """Write folder/name.svg and folder/name.png; return the path of the PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-    figure.set_layout_engine(None)  # the layout is final; it takes longer than drawing
+    figure.set_layout_engine(None)  # the layout is final; computing it again takes longer than drawing
     figure.savefig(folder / f"{name}.png", dpi=150)
     return folder / f"{name}.png"
 
 
 def plain(axis: Axis) -> None:
-    """Write 0.01 instead of a power of ten at ticks of a logarithmic axis, because superscripts are slow to draw."""
+    """Label the ticks of a logarithmic axis 0.01, not 10^-2, because superscripts are slow to draw."""
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(_Plain(labelOnlyBase=False))
 
 
 class _Plain(LogFormatter):
-    """Formatter of the same ticks as its base, with plain numbers."""
+    """Formatter that labels the same ticks as `LogFormatter`, with plain numbers."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def pump_end(*rates: Array) -> float:
-    """Return the end of a pump rate axis in uL/s, for rates in mL/s: the usual bench's, or beyond the largest rate."""
+    """Return the upper end of a pump rate axis, uL/s: 21, or 5 % above the largest rate. Args: rates: mL/s."""
     return max(21.0, *(1050.0 * float(np.nanmax(rate, initial=0.0)) for rate in rates))
 
 
 def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:
-    """Draw one line for one agent; median, quartiles and range for several. curves: (K, S)."""
+    """Draw a line for one agent; the median, quartiles and range of several agents. Args: curves: (K, S)."""
     if curves.shape[1] == 1:
         ax.plot(x, curves[:, 0], color=colour, linewidth=1.2, label=label)
         return
@@ -87,11 +87,11 @@ def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> N
 
 
 def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_step: Array) -> Figure:
-    """Draw reward per episode (the paper's Fig. 2b) and regret of the greedy policy during training.
+    """Draw the cost per episode (the paper's Fig. 2b) and the regret of the greedy policy during training of S agents.
 
     Args:
-      episode_return: (episodes, S). eval_step: (K,). regret_pct: on the selection grid, (K, S).
-      best_step: step of the kept policy, (S,).
+      episode_return: reward per episode, (episodes, S). eval_step: environment steps of the K evaluations, (K,).
+      regret_pct: regret on the selection grid, (K, S). best_step: step at which the kept policy was saved, (S,).
     """
     figure, (left, right) = new_figure(9.0, 3.4, 1, 2)
     episodes = np.arange(1, episode_return.shape[0] + 1)
@@ -111,9 +111,9 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
 
 
 def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Figure:
-    """Draw the learned and the optimal pump rate over OD and setpoint.
+    """Draw the learned and the optimal pump rate as maps over OD and setpoint.
 
-    Args: od (X,), setpoint (Y,), learned and optimal (Y, X) in mL/s.
+    Args: od: (X,). setpoint: (Y,). learned, optimal: pump rates, mL/s, (Y, X).
     """
     most, ends = max(20.0, 1000.0 * float(learned.max()), 1000.0 * float(optimal.max())), setpoint[[0, -1]]
     labels = "OD x", "setpoint, OD", "pump rate, µL/s"
@@ -121,11 +121,12 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
 
 
 def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> Figure:
-    """Draw the learned and the optimal fraction of the largest pump rate over error and growth share.
+    """Draw the learned and the optimal dose as maps over error and growth share.
 
-    Args: error (X,), periods of full pump; share (Y,); learned and optimal (Y, X), 0 to 1.
+    Args: error: in periods of full pump, (X,). share: growth share, (Y,). learned, optimal: dose as a fraction of a
+      period of full pump, (Y, X).
     """
-    labels = "error e, periods of full pump", "growth's share of the pump, s", "dose, share of full pump"
+    labels = "error e, periods of full pump", "growth share s", "dose, fraction of full pump"
     return _maps(error, share, (learned, optimal), 1.0, (np.zeros(2), share[[0, -1]]), labels)
 
 
@@ -145,11 +146,11 @@ def _maps(
 
 
 def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates: Array, best_rates: Array) -> Figure:
-    """Draw noise-free closed loops of the learned policy and the optimum from the same starts, a column per setpoint.
+    """Draw noise-free closed loops of the learned policy and the optimum, from the same starts; a column per setpoint.
 
     Args:
-      minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
-      rates, best_rates: pump rates in mL/s, (K, G).
+      minutes: (K + 1,). od, best: OD of the learned policy and of the optimum, with the start, (K + 1, G).
+      setpoint: (G,). rates, best_rates: their pump rates, mL/s, (K, G).
     """
     unit, sign = clock(minutes[-1])
     labels, end = ("OD", "pump rate, µL/s", f"time, {sign}"), (-0.5, pump_end(rates, best_rates))
@@ -158,12 +159,13 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
 
 
 def relative_trajectories(error: Array, best: Array, share: Array, levels: Array, best_levels: Array) -> Figure:
-    """Draw noise-free closed loops in relative coordinates, a column per growth share.
+    """Draw noise-free closed loops in relative coordinates, as `trajectories` does; a column per growth share.
 
-    Args: error, best: e including the start, (K + 1, G). share: (G,). levels, best_levels: (K, G), 0 to 1.
+    Args: error, best: error e of the learned policy and of the optimum, with the start, (K + 1, G). share: growth
+      share, (G,). levels, best_levels: their doses as fractions of a period of full pump, (K, G).
     """
-    labels = "error e, periods of full pump", "dose, share of full pump", "control periods"
-    shown = 40  # periods; later the loop is at rest
+    labels = "error e, periods of full pump", "dose, fraction of full pump", "control periods"
+    shown = 40  # periods; the loop has settled by then
     series = (np.arange(shown), *(each[:shown] for each in (error, best, levels, best_levels)))
     return _loops(series, share, "growth takes {:g} of the pump", labels, (-0.03, 1.03))
 
@@ -172,7 +174,7 @@ def _loops(
     series: Sequence[Any], group: Array, title: str, labels: tuple[str, str, str], end: tuple[float, float],
     target: bool = False,
 ) -> Figure:  # fmt: skip
-    """Draw time, state, the optimum's, action and the optimum's, a column per value of `group`, the state's target."""
+    """Draw state (above) and action (below) over time, with those of the optimum; a column per value of `group`."""
     time, state, best, action, best_action = series
     groups, until = np.unique(group), time[: len(action)]
     figure, axes = new_figure(3.4 * groups.size, 4.6, 2, groups.size, sharex=True, sharey="row", height_ratios=[2, 1])
@@ -205,11 +207,11 @@ def closed_loop(
     refused: Array | None = None,
     aim: Array | None = None,
 ) -> Figure:
-    """Draw a recorded closed loop: OD over setpoint, above pump rate (and temperature).
+    """Draw a recorded closed loop of N reactors: OD with its setpoint, pump rate, and temperature if given.
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
-      marks: minute and text of vertical lines. refused: rejected OD, (K, N); far values at the edge.
-      aim: setpoint given to the controller, (K, N), with announced changes.
+      marks: minute and text of vertical lines. refused: rejected OD readings, (K, N); a value beyond the axis is
+      drawn at its edge. aim: setpoint given to the controller, which may be an announced one, (K, N).
     """
     unit, sign = clock(float(np.nanmax(minutes, initial=0.0)))
     time, rows = minutes / unit, 2 if temperature is None else 3
@@ -239,7 +241,7 @@ def closed_loop(
         low, high = axes[0].get_ylim()
         axes[0].plot(
             time, np.clip(refused, low, high), "x", color="#7f7f7f", markersize=4, clip_on=False,
-            label=["not believed", *[None] * (len(names) - 1)],
+            label=["rejected reading", *[None] * (len(names) - 1)],
         )  # fmt: skip
         axes[0].set_ylim(low, high)
     axes[0].set(ylabel="OD", title=title)

@@ -1,6 +1,6 @@
-"""A run folder as one self-contained HTML page: tables, figures, configuration.
+"""The HTML page of a run folder: tables, figures, configuration.
 
-The page has no links: figures (SVG, else PNG) and style are embedded. Its markup is report.html.j2.
+The page is one file: figures (SVG, else PNG) and style are embedded. Its template is report.html.j2.
 """
 
 import base64
@@ -24,9 +24,9 @@ from experiments.reporting.tables import Emphasis, Table, number, typeset
 from experiments.reporting.verdict import verdict
 
 HERE = Path(__file__).parent
-PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, pattern of its content
+PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, bytes that it contains
 
-LARGEST = 200_000  # characters of a configuration
+LARGEST = 200_000  # characters of a configuration file; a longer one is not parsed
 ALIAS = re.compile(r"(?:^|[\s\[,:-])[&*]\w", re.MULTILINE)
 PLACE = re.compile(r"(?<![\w.:/~…])/(?:[^\s/:;,'\"]+/)+[^\s/:;,'\"\])]+")
 UNITS = {
@@ -37,7 +37,7 @@ UNITS = {
     "od_abs_error_mean": "OD", "mu": "1/min", "regret_pct_last": "%",
     "optimum_cost": "squared error",
 }  # fmt: skip
-"""Labels of keys of summary.json; a key with one of `ENDINGS` contains its unit."""
+"""Key of summary.json -> its unit, for keys whose name does not end with one of `ENDINGS`."""
 ENDINGS = {"_pct": "%", "_min": "min", "_ml": "mL", "_s": "s"}
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
@@ -47,9 +47,9 @@ templates.tests["best"] = lambda cell: isinstance(cell, Emphasis)
 
 @dataclass
 class Page:
-    """A page: headings with their blocks, and its tables.
+    """HTML page. sections: headings, each with its blocks. tables: all tables of the page.
 
-    A block is the name of a macro of report.html.j2 and its arguments.
+    A block is the name of a macro of report.html.j2 and the arguments of that macro.
     """
 
     title: str
@@ -77,8 +77,8 @@ class Page:
     def figure(self, path: Path, title: str, caption: str = "") -> None:
         """Append a figure file, SVG or PNG.
 
-        The file may be foreign: a browser runs no script of an image and follows no address in it. Raises: ValueError
-        for a file that is no image, OSError for an unreadable one.
+        Files of unknown origin are safe: a browser runs no script inside an image and opens no address from it. Raises:
+        ValueError for a file that is neither SVG nor PNG, OSError for an unreadable file.
         """
         media, mark = PICTURES.get(path.suffix, ("", b""))
         data = path.read_bytes() if media else b""
@@ -102,7 +102,7 @@ def _other_versions() -> str:
 
 
 def provenance(page: Page, run: Path) -> None:
-    """Add command, seed, versions, and the folded configuration."""
+    """Add the overrides, seed and versions of a run, and its configuration, folded."""
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)
@@ -117,7 +117,7 @@ def provenance(page: Page, run: Path) -> None:
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield leaves of nested mappings with dotted names; lists are leaves."""
+    """Yield (dotted name, value) of each leaf of nested mappings; a list is a leaf."""
     for key, item in value.items():
         if isinstance(item, Mapping):
             yield from flat(item, f"{prefix}{key}.")
@@ -126,7 +126,7 @@ def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 
 def _config(text: str) -> Mapping[str, Any]:
-    """Read the configuration of a run; {} if it is unreadable or recursive."""
+    """Read the configuration of a run; {} if it is invalid, too long or contains YAML aliases."""
     if len(text) > LARGEST or ALIAS.search(text):
         return {}
     try:
@@ -148,7 +148,7 @@ def _near(text: str) -> str:
 
 
 def _labelled(key: str, kind: str) -> str:
-    """Label a key of summary.json with its unit. Args: kind: of the task, for the unit of errors."""
+    """Label a key of summary.json with its unit. Args: kind: kind of the task, which determines the unit of errors."""
     *parents, name = key.split(".")
     unit = UNITS.get(parents[-1] if parents and name in ("value", "ci95") else name, "")
     if unit == "OD" and "error" in name:
@@ -178,9 +178,9 @@ def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
 
 
 def _results(page: Page, run: Path, prefix: str) -> None:
-    """Add summary.json as tables, whose names begin with `prefix`, and every figure of a run folder.
+    """Add every figure of a run folder, and summary.json as tables; `prefix` begins the tables' names.
 
-    With a verdict the tables are folded.
+    If the run has a verdict, the table of single values is folded.
     """
     summary, config = _read(run)
     leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
@@ -206,16 +206,16 @@ def _figures(page: Page, run: Path) -> None:
 
 
 def _command(run: Path) -> str:
-    """Return the name of a run folder without the number of a step."""
+    """Return the name of a run folder without its leading step number."""
     return re.sub(r"^\d+_", "", run.name).capitalize()
 
 
 def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
-    """Build the page of any command's run: results and configuration. `runs`: the folder itself or runs below it.
+    """Build the page of a run of any command, or of several runs: results and configuration.
 
-    For several runs it begins with the result of each.
+    A page of several runs begins with a summary of their results.
 
-    Args: after: adds further parts of a run; called with the run and its name on a page of several.
+    Args: runs: `folder` itself, or runs below it. after: function (page, run, label) that adds further blocks of a run.
     """
     name = folder.resolve()
     title = next((c for c in map(_command, (name, *name.parents)) if c[:1].isalpha()), "Run")
@@ -226,7 +226,7 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     read = [(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping)]
     told = [said for each in read if (said := verdict(*each)) is not None]
     if told and "" not in labels:
-        page.section("In short")
+        page.section("Summary")
         page.add("verdicts", found=told)
     for label, run in labels.items():
         page.section(f"{label}: results" if label else "Results")
@@ -235,13 +235,13 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
         _results(page, run, f"{run.name}_" if label else "")
         if after is not None:
             after(page, run, label)
-        page.section(f"{label}: what was run" if label else "What was run")
+        page.section(f"{label}: command and configuration" if label else "Command and configuration")
         provenance(page, run)
     return page
 
 
 def save(page: Page, folder: Path) -> Path:
-    """Write report.html and the page's tables (tables/, CSV and LaTeX) into a run folder; returns the page's path."""
+    """Write report.html, and the page's tables as tables/*.csv and *.tex, into a folder; return the page's path."""
     tables.write(page.tables, folder / "tables")
     target = folder / "report.html"
     target.write_text(page.html(), encoding="utf-8")

@@ -22,14 +22,14 @@ from experiments.reporting.sweep_results import (
 )  # fmt: skip
 from experiments.reporting.tables import Emphasis, Table, interquartile_mean, number
 
-LONG = 40  # characters of a name, beyond which its row number is shown
-DRAWN = 8  # configurations in a figure, one per colour; the table has all
-SHOWN = 4  # measures on the page
+LONG = 40  # a name of this many characters or more is replaced by its row number in figures
+DRAWN = 8  # most configurations in a figure, one per colour; the table has all
+SHOWN = 4  # most measures on the page
 STATISTICS = ("n", "median", "IQM", "95 % of IQM", "worst")
 
 
 def repeats(command: str, one: Configuration) -> str:
-    """Write the command that runs a configuration again, with all its seeds."""
+    """Return the command that repeats all runs (seeds) of a configuration."""
     first = dict(one.jobs[0].overrides)
     for key in first:
         several = list(dict.fromkeys(job.overrides[key] for job in one.jobs if key in job.overrides))
@@ -57,14 +57,12 @@ def _row(place: int, one: Configuration, names: Sequence[str]) -> tuple[str, ...
 
 
 def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str], str], note: str) -> None:
-    """Add a table per measure, and a folded table of all measures, as in configurations.csv."""
+    """Add one table per measure, and a folded table of all measures, which is also written to configurations.csv."""
     names = _measures(ranked)
     for name in names:
         rows = tuple(_row(k + 1, one, [name]) for k, one in enumerate(ranked))
         columns = ("#", *ranked[0].values, *STATISTICS)
-        page.table(
-            Table(f"configurations_{name}", f"Configurations, the best first: {called(name)}", columns, rows, note)
-        )
+        page.table(Table(f"configurations_{name}", f"Configurations, best first: {called(name)}", columns, rows, note))
     rows = tuple(_row(k + 1, one, names) for k, one in enumerate(ranked))
     columns = ("#", *ranked[0].values, *(f"{name}: {what}" for name in names for what in STATISTICS))
     page.table(Table("configurations", "All measures", columns, rows), folded="All measures in one table")
@@ -73,7 +71,7 @@ def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str],
 def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: Callable[[str], str]) -> str:
     done = sum(job.state == "finished" for job in jobs)
     if not ranked or not ranked[0].measured:
-        return f"{done} of {len(jobs)} jobs finished; none of them left a number to compare."
+        return f"{done} of {len(jobs)} jobs finished, but no result can be compared: none has a number."
     best, name = ranked[0], next(iter(ranked[0].measured))
     s = statistics(best.measured[name])
     what = called(name)
@@ -82,15 +80,15 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
         if len(ranked) > 1
         else f"One configuration, {best.name}"
     )
-    middle = f"; the middle half of its {s.n} seeds has {number(s.iqm)} on average" if s.n > 1 else ""
-    text = f"{head}: {what} {number(s.worst)} at its worst{middle}"
+    middle = f" (interquartile mean of {s.n} seeds: {number(s.iqm)})" if s.n > 1 else ""
+    text = f"{head}. Worst {what}: {number(s.worst)}{middle}"
     if len(ranked) > 1:
         other = statistics(ranked[1].measured[name])
         apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]
-        text += f"; the next has {number(other.worst)}"
-        text += "" if apart else ", and the intervals of the two do not tell them apart"
+        text += f"; second-best configuration: {number(other.worst)}"
+        text += "" if apart else ", no significant difference (their 95 % intervals overlap)"
     if what == MERIT:
-        text += f". That is {'within' if s.worst <= 1.0 else 'beyond'} the limits of the task, which are a score of 1"
+        text += f". A score of 1 is the task's limit: {'met' if s.worst <= 1.0 else 'not met'}"
     return f"{text}. {done} of {len(jobs)} jobs finished."
 
 
@@ -103,12 +101,12 @@ def _missing(page: Page, jobs: Sequence[Result], again: str) -> None:
         (j.folder.name, " ".join(f"{k}={v}" for k, v in j.overrides.items()), j.state, j.error or "–") for j in left
     )
     page.table(Table("missing_jobs", f"{len(left)} of {len(jobs)} jobs", ("job", "overrides", "state", "error"), rows))
-    page.text("What is missing, and nothing else, is done by the command below.")
+    page.text("This command runs only the jobs without a result:")
     page.add("folded_text", heading="Command", text=again)
 
 
 def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: Callable[[str], str]) -> None:
-    """Draw learning curves, or else the values of the first measure; then the values of the others."""
+    """Draw the learning curves, if the jobs have them, and then the values of each measure."""
     shown = {one.name if len(one.name) < LONG else f"#{k + 1}": one for k, one in enumerate(ranked[:DRAWN])}
     note = f"The best {DRAWN} of {len(ranked)} configurations." if len(ranked) > DRAWN else ""
     page.section("Figures")
@@ -129,7 +127,8 @@ def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: 
 def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> Page:
     """Build the page of a sweep.
 
-    Args: jobs: all of them, also those without a result. again: the command that runs the missing jobs.
+    Args: command: name of the command that was swept. jobs: all jobs, also those without a result. again: the command
+      that runs the missing jobs.
     """
     ranked, common = configurations(jobs)
     task = next((job.task for job in jobs if job.state == "finished"), "density")
@@ -141,9 +140,9 @@ def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> 
     page.section("Result")
     page.text(_headline(ranked, jobs, called))
     if ranked and ranked[0].measured:
-        page.add("keys", pairs=[("best", ranked[0].name), ("again, all its seeds", repeats(command, ranked[0]))])
+        page.add("keys", pairs=[("best", ranked[0].name), ("command to repeat its runs", repeats(command, ranked[0]))])
         shared = ", ".join(f"{key} = {value}" for key, value in common.items()) or "none"
-        note = f"Seeds are pooled, lower is better; IQM: interquartile mean. Overrides of all jobs: {shared}."
+        note = f"Each row pools its seeds; lower is better. IQM: interquartile mean. Overrides of all jobs: {shared}."
         _tables(page, ranked, called, note)
         _figures(page, folder, ranked, called)
     _missing(page, jobs, again)
@@ -151,9 +150,9 @@ def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> 
 
 
 def learning_curves(curves: Sequence[tuple[str, Array, Array]], quantity: str) -> Figure:
-    """Draw the interquartile mean over seeds as a line, the worst seed dashed, a colour per configuration.
+    """Draw learning curves in one colour per configuration: interquartile mean over seeds; the worst seed dashed.
 
-    Args: curves: name, steps (K,), values (K, S). quantity: with its unit.
+    Args: curves: name, steps (K,) and values (K, S) of each configuration. quantity: label of the axis, with unit.
     """
     figure, (ax,) = charts.new_figure(9.0, 4.0 + 0.12 * len(curves))
     for k, (name, steps, each) in enumerate(curves):
@@ -170,9 +169,9 @@ def learning_curves(curves: Sequence[tuple[str, Array, Array]], quantity: str) -
 
 
 def values(measured: Mapping[str, Array], quantity: str) -> Figure:
-    """Draw a row per configuration, the best on top: a dot per seed or reactor, a bar at the interquartile mean.
+    """Draw one row per configuration: a dot per seed or reactor, and a bar at the interquartile mean.
 
-    Args: measured: name -> (n,). quantity: with its unit.
+    Args: measured: name -> values (n,), first on top. quantity: label of the axis, with unit.
     """
     figure, (ax,) = charts.new_figure(9.0, 1.2 + 0.3 * len(measured))
     for row, each in enumerate(measured.values()):

@@ -1,4 +1,4 @@
-"""Jobs of a sweep as configurations: their differences, pooled seeds, and statistics of their measures."""
+"""Configurations of a sweep: jobs pooled over seeds, and statistics of their measures."""
 
 import csv
 import math
@@ -21,14 +21,14 @@ LABELS = {
     "ise": "ISE over all windows, OD² min",
     "itae": "ITAE over all windows, OD min²",
     "volume_ml": "medium, mL",
-    "objective": "what the command returned",
+    "objective": "return value of the command",
 }
-MERIT = "score (the larger of regret and error at rest, each divided by its limit)"  # returned by train
+MERIT = "score (the larger of regret and steady error, each divided by its limit)"  # return value of train
 
 
 @dataclass(frozen=True)
 class Result:
-    """A job: name of its folder, overrides key -> value, state, error, objective, summary, kind of its task."""
+    """Job of a sweep. overrides: key -> value. objective: return value of the command. task: kind of its task."""
 
     folder: Path
     overrides: Mapping[str, str]
@@ -41,7 +41,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Jobs that differ only in the seed. values: of the varied settings. measured: name -> (n,)."""
+    """Jobs that differ only in the seed. values: varied setting -> its value. measured: measure -> values, (n,)."""
 
     values: dict[str, str]
     jobs: list[Result]
@@ -49,13 +49,13 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """Name in a figure."""
+        """Name of the configuration in figures and tables."""
         varied = (f"{key.rpartition('.')[2]} {number_or_text(value)}" for key, value in self.values.items())
         return ", ".join(varied) or "all jobs"
 
 
 def number_or_text(value: str) -> str:
-    """Format a number to four digits, anything else as it stands."""
+    """Format a number to four digits; return any other text unchanged."""
     try:
         return number(float(value), 4)
     except ValueError:
@@ -64,7 +64,7 @@ def number_or_text(value: str) -> str:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of n values. interval: 95 % of the interquartile mean, by bootstrap; nan for one value."""
+    """Statistics of n values. iqm: interquartile mean. interval: its 95 % bootstrap interval, nan for one value."""
 
     n: int
     median: float
@@ -74,7 +74,7 @@ class Statistics:
 
 
 def statistics(values: Array) -> Statistics:
-    """Compute statistics of n >= 1 values. The interquartile mean is that of the middle half (Agarwal 2021)."""
+    """Compute statistics of n >= 1 values; interquartile mean with interval as in Agarwal 2021."""
     from scipy.stats import trim_mean
 
     low = high = math.nan
@@ -86,17 +86,17 @@ def statistics(values: Array) -> Statistics:
 
 
 def label(measure: str, task: str, command: str) -> str:
-    """Label a measure with its unit."""
+    """Return the label of a measure, with its unit. Args: task: kind of the task. command: name of the command."""
     if (measure, command) == ("objective", "train"):
         return MERIT
     return LABELS.get(measure, measure).format(unit=ERROR_UNITS.get(task, ""))
 
 
 def measures(summary: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Collect the measures of a run: name -> a value per seed or reactor, or one. The names depend on the command.
+    """Collect the measures of a run: name -> list of values. The names depend on the command.
 
-    A training has them per seed. A closed loop has them per window: ISE and ITAE are summed over the windows of a
-    reactor, the steady error is that of its worst window. For any other command they are its plain numbers.
+    A training has one value per seed. A closed loop has one per reactor: ISE and ITAE are summed over its windows, the
+    steady error is that of the worst window. Any other command has one value for each number in its summary.
     """
     if isinstance(summary.get("seeds"), list):
         return {name: _finite(summary.get(name)) for name in ("regret_pct", "steady_abs_error")}
@@ -123,9 +123,9 @@ def _of_windows(summary: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[str, str]]:
-    """Pool finished jobs over seeds, the best first; return also the overrides that all jobs share.
+    """Pool finished jobs over seeds, the best configuration first; return also the overrides that all jobs share.
 
-    The best has the least objective at its worst seed; without objectives, the least worst value of the first measure.
+    The best has the smallest worst-seed objective; without objectives, the smallest worst value of the first measure.
     """
     keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if key.rpartition(".")[2] != "seed"))
     done = [job for job in jobs if job.state == "finished"]
@@ -148,7 +148,7 @@ def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[st
 
 
 def curve(jobs: Sequence[Result], tag: str) -> tuple[Array, Array]:
-    """Read a tag of progress.csv: steps (K,), and a column per seed of all jobs, (K, S), nan without a value."""
+    """Read a tag from each job's progress.csv: steps (K,), and values (K, S), a column per seed, nan if missing."""
     found: dict[tuple[str, str], dict[int, float]] = {}
     for job in jobs:
         try:

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-LONG_MIN = 180.0  # longer times are written in hours
+LONG_MIN = 180.0  # min; times above this are given in hours
 
 
 class Emphasis(str):
-    """Text of a highlighted cell."""
+    """Text of a table cell that is highlighted."""
 
     __slots__ = ()
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Format significant digits, without an exponent if readable; a dash for an unknown value."""
+    """Format a number to `digits` significant digits; large numbers without exponent; None and nan as a dash."""
     if value is None or value != value:
         return "–"
     if value == 0.0:
@@ -30,21 +30,21 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def plus_minus(mean: float | None, sd: float | None) -> str:
-    """Format mean ± sd, the deviation to two digits; only the mean without a deviation, or with one below rounding."""
+    """Format mean ± sd, the sd to two digits; only the mean if the sd is unknown or negligible."""
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean)
     return f"{number(mean)} ± {number(sd, 2)}"
 
 
 def interquartile_mean(values: NDArray[np.float64]) -> float:
-    """Return the mean of the middle half (Agarwal 2021); robust like the median, and smoother over few seeds."""
+    """Return the mean of the middle half of the finite values (Agarwal 2021); nan if there are none."""
     finite = np.sort(values[np.isfinite(values)])
     cut = finite.size // 4
     return float(finite[cut : finite.size - cut].mean()) if finite.size else float("nan")
 
 
 def clock(last: float) -> tuple[float, str]:
-    """Return the unit of time in min, and its symbol, for times up to `last`."""
+    """Return the time unit for an axis up to `last` min: (60, "h") above LONG_MIN, else (1, "min")."""
     return (60.0, "h") if last > LONG_MIN else (1.0, "min")
 
 
@@ -55,29 +55,29 @@ def span(first: float, last: float) -> str:
 
 
 def count(n: int, one: str) -> str:
-    """Format a number of items; `one` is the singular."""
+    """Format a count with its noun, "1 dose" or "3 doses"; `one` is the singular."""
     return f"{n} {one}{'' if n == 1 else 's'}"
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format a table in Markdown, with its last line end."""
+    """Format a table in Markdown, ending with a newline."""
     head, *body = ("| " + " | ".join(map(str, row)) + " |" for row in (columns, *rows))
     return "\n".join([head, "|" + "---|" * len(columns), *body]) + "\n"
 
 
 def typeset(text: str) -> str:
-    """Use true minus signs before numbers, and ± for +-."""
+    """Replace hyphens before numbers by minus signs, and +- by ±."""
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text.replace("+-", "±"))
 
 
 @dataclass(frozen=True)
 class Table:
-    """Table with headings and rows, written in several formats.
+    """Table that can be written as CSV, LaTeX or HTML.
 
-    name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Emphasis`; the first names
-    the row.
+    name: name of its files. title, note: text above and below the table. columns: headings. rows: cells as plain text
+    or `Emphasis`; the first cell names the row.
 
-    Raises: ValueError for a row of another length than the headings.
+    Raises: ValueError if a row and the headings differ in length.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Table:
                 raise ValueError(f"table {self.name}: row of {len(row)} cells under {len(self.columns)} headings")
 
     def csv(self) -> str:
-        """Format comma-separated values with the headings as first line."""
+        """Format the table as comma-separated values; the first line has the headings."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
@@ -100,7 +100,7 @@ class Table:
         return out.getvalue()
 
     def latex(self) -> str:
-        """Format a booktabs table, to be read with \\input."""
+        """Format a LaTeX table in booktabs style; include it with \\input."""
         lines = [
             r"\begin{table}",
             rf"\caption{{{_tex(self.title)}}}\label{{tab:{self.name}}}",
@@ -128,7 +128,7 @@ def _tex(text: str) -> str:
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:
-    """Write NAME.csv and NAME.tex of each table."""
+    """Write each table as NAME.csv and NAME.tex into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for table in tables:
         (folder / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Curves of a run: TensorBoard events, and a CSV of the same scalars.
+"""Writers of a run's curves: TensorBoard events, and a CSV file of the same scalars.
 
-It uses TensorBoard's own event writer, so a bench without torch can show a run live. Every tag has the description of
-`reporting/curves.py`.
+They use TensorBoard's own event writer, so a computer without PyTorch can show a run live. `reporting/curves.py`
+describes each tag.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from experiments.cli.stop import undisturbed
 from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 from experiments.reporting.tables import interquartile_mean
 
-MOST_CURVES = 64  # a larger population gets only its statistics
-LIVE_S = 5.0  # time until written values are visible
+MOST_CURVES = 64  # most agents with curves of their own; a larger population has only statistics
+LIVE_S = 5.0  # longest time between two flushes while values are written
 NUMBER = TensorShapeProto()
 LINE, THREE = (TensorShapeProto(dim=[TensorShapeProto.Dim(size=n)]) for n in (1, 3))
 
 
 class Events:
-    """TensorBoard events of one run, visible within seconds while writing continues.
+    """Writer of the TensorBoard events of one run; events are visible within seconds.
 
     Args:
-      folder: where the event file goes.
-      first_step: on resume, earlier events at this step and later are hidden.
+      folder: folder of the event file.
+      first_step: for a resumed run; TensorBoard hides older events at this step and later.
     """
 
     def __init__(self, folder: Path, first_step: int = 0) -> None:
@@ -73,7 +73,7 @@ class Events:
         return point
 
     def scalars(self, values: Mapping[str, float], step: int, wall: float | None = None) -> None:
-        """Write one point of each curve. Args: values: by tag. wall: s since 1970, if not now."""
+        """Write one point of each curve. Args: values: tag -> value. wall: time of the point, s since 1970, or now."""
         self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
     def _strings(self, tag: str, values: list[bytes], shape: Any, metadata: Any, step: int) -> None:
@@ -81,7 +81,7 @@ class Events:
         self._add([Summary.Value(tag=tag, tensor=tensor, metadata=metadata)], step)
 
     def picture(self, tag: str, png: Path, step: int) -> None:
-        """Write a PNG file under TensorBoard's images. Raises: OSError for an unreadable file."""
+        """Write a PNG file to TensorBoard's page Images. Raises: OSError for an unreadable file."""
         data = png.read_bytes()
         size = [str(int.from_bytes(data[i : i + 4], "big")).encode() for i in (16, 20)]  # width and height
         self._strings(tag, [*size, data], THREE, image.create_summary_metadata("", described(tag)), step)
@@ -102,20 +102,20 @@ class Events:
         self._strings(tag, [made.SerializeToString()], NUMBER, said, 0)
 
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
-        """Write a row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
+        """Write a row of TensorBoard's HPARAMS table. TensorBoard adds the last values of the tags in `METRICS`.
 
-        Other arguments of the command line get columns too, so a sweep has one for each varied key. TensorBoard shows
-        only the columns of the first run that it reads; one column has all arguments.
+        Each argument of the command line has a column, so a sweep shows every varied key. TensorBoard shows only the
+        columns of the first run that it reads; the column "given" lists all arguments of a run.
 
-        Args: values: by the names in `PARAMETERS`, or by other names. folder: run folder, whose last two names are the
-        row's; rows of the same name would be averaged. part: of it, if a run has several rows.
+        Args: values: name -> value; names in `PARAMETERS` or others. folder: run folder; its last two path components
+        name the row, because TensorBoard averages rows of one name. part: added to the name if a run has several rows.
         """
         varied = _varied(folder)
         listed = {"given": " ".join(f"{key}={value}" for key, value in varied.items())} if varied else {}
         values = {**{key: _number(value) for key, value in varied.items()}, **values, **listed}
         name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
         own = {
-            key: Column(key, "of the task or the command line", not isinstance(value, str))
+            key: Column(key, "parameter of the task, or argument of the command line", not isinstance(value, str))
             for key, value in sorted(values.items())
             if key not in PARAMETERS
         }
@@ -161,7 +161,7 @@ def _number(text: str) -> float | str:
 
 
 def _ordered(key: str) -> str:
-    """Return a name that sorts in the order of `PARAMETERS`; its title is displayed."""
+    """Return a column's name with a number in front, so that columns sort as in `PARAMETERS`; it is not displayed."""
     return f"{[*PARAMETERS, key].index(key)}_{key}"
 
 
@@ -171,12 +171,12 @@ def _column(key: str, column: Column) -> api_pb2.HParamInfo:
 
 
 class PopulationWriter:
-    """Writer of the scalars of S agents: each agent's curve as a separate run, and the population's statistics.
+    """Writer of the scalars of S agents: each agent's curves as a separate run, and statistics of all agents.
 
-    One agent: tags are in the run folder itself. Several: `agents/seedNNNN/` have the single curves, and the run folder
-    has tag/iqm, tag/min and tag/max over seeds. Every value is also a row of progress.csv.
+    One agent: the run folder has its curves. Several agents: `agents/seedNNNN/` has the curves of each agent, and the
+    run folder has tag/iqm, tag/min and tag/max over agents. Every value is also a row of progress.csv.
 
-    Args: folder: run folder. seeds: of the agents. first_step: step of the checkpoint a run is resumed from, or 0.
+    Args: folder: run folder. seeds: one per agent. first_step: step of the checkpoint that a run resumes from, or 0.
     """
 
     def __init__(self, folder: Path, seeds: Sequence[int], first_step: int = 0) -> None:
@@ -194,7 +194,7 @@ class PopulationWriter:
 
     @property
     def agents(self) -> Sequence[Events]:
-        """Folders of each agent's curves; none for a large population."""
+        """Event writer of each agent's own curves; empty for more than `MOST_CURVES` agents."""
         return self._agents if len(self._seeds) > 1 else [self.events]
 
     def _rows_until(self, step: int) -> list[list[str]]:
@@ -205,7 +205,7 @@ class PopulationWriter:
         return [row for row in rows if len(row) == 4 and row[0].isdigit() and int(row[0]) <= step]
 
     def scalars(self, step: int, values: Mapping[str, NDArray[np.float64] | float]) -> None:
-        """Write tag -> value at an environment step; arrays have one entry per agent."""
+        """Write values of tags at an environment step. Args: values: tag -> number, or one entry per agent, (S,)."""
         shared: dict[str, float] = {}
         single: list[dict[str, float]] = [{} for _ in self._agents]
         for tag, value in values.items():

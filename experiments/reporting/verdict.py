@@ -1,4 +1,4 @@
-"""First sentence of a run's page, from its configuration and summary: command and result."""
+"""Verdict at the top of a run's page: what was run, the main results, and how good they are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,20 +12,20 @@ from experiments.reporting.tables import count, number
 
 Summary = Mapping[str, Any]
 REGRET, STEADY = 0.5, 0.003
-"""Per cent and OD that `env=sim` aims for (experiments/training/density.py); half a per cent is not seen in a
-recording, and 0.003 OD is the noise of the sensor."""
+"""Limits of regret, %, and steady error, OD, for `env=sim` (experiments/training/density.py). A regret of 0.5 % is
+invisible in a recording; 0.003 OD is the noise of the sensor."""
 
 REMEDY = (
-    "policy=shipped, which is certified for every growth rate and pump and needs no training; or train with "
-    "the same words and another seed (seed=1), since seeds differ at the ends of the range, and certify that one"
+    "use policy=shipped, which is certified for every growth rate and pump and needs no training; or repeat the "
+    "training with another seed (seed=1), since seeds differ at the ends of the range, and certify the new policy"
 )
 """Remedies for a failed requirement of a certificate."""
-SHOWN = 3  # displayed failed requirements
+SHOWN = 3  # number of failed requirements on the page
 
 
 @dataclass(frozen=True)
 class Headline:
-    """claim: the run. items: results with units. remark: verdict and its limit."""
+    """Verdict on a run. claim: what was run. items: results with units. remark: how good the results are."""
 
     claim: str
     items: list[str] = field(default_factory=list)
@@ -33,7 +33,7 @@ class Headline:
 
 
 def verdict(summary: Summary, config: Mapping[str, Any]) -> Headline | None:
-    """Return the verdict on a training, deployment, calibration or certificate, None for any other run."""
+    """Return the verdict on a training, deployment, calibration, certificate or replay; None for any other run."""
     for key, of in KINDS.items():
         if key in summary:
             try:
@@ -48,29 +48,31 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     agents = f"{regret.size} agents" if regret.size > 1 else f"one agent, seed {summary['seeds'][0]},"
     kind = env.get("kind", "density")
     model = f"mu {number(env['mu'])} 1/min, tau {number(env['tau'])}" if "tau" in env else f"the task env={kind}"
-    claim = f"Training: {agents} learned {model} for {summary['env_steps']} steps in {summary['train_seconds']:.0f} s."
+    claim = (
+        f"Training: {agents} trained on {model} for {summary['env_steps']} steps in {summary['train_seconds']:.0f} s."
+    )
     unit = ERROR_UNITS.get(kind, ERROR_UNITS["relative"])
     law = summary["myopic_regret_pct"]
     worst = "of the worst agent " if regret.size > 1 else ""
     items = [
-        f"regret {worst}{number(regret.max())} %: what the policy costs beyond the exact optimum",
-        f"error at rest at its worst setpoint {worst}{number(steady.max())} {unit}",
-        f"the one-line controller that looks one period ahead: regret {number(round(law, 4))} %, error "
+        f"regret {worst}{number(regret.max())} %: cost of the policy above that of the exact optimum",
+        f"steady error at the worst setpoint {worst}{number(steady.max())} {unit}",
+        f"for comparison, the one-line controller (one period ahead): regret {number(round(law, 4))} %, steady error "
         f"{number(summary['myopic_steady_abs_error'])} {unit}",
     ]
     if kind != "density":
         return Headline(claim, items)
     if float(regret.max()) > REGRET:
-        word = f"Not good yet: the regret is above {REGRET:g} %; train longer, or with another seed"
+        word = f"Not good yet: the regret is above {REGRET:g} %. Train longer, or with another seed"
     elif float(steady.max()) > STEADY:
-        word = f"Nearly optimal, but it rests more than {STEADY:g} OD from a setpoint; another seed may rest closer"
+        word = f"Nearly optimal, but the steady error is above {STEADY:g} OD. Another seed may be better"
     else:
-        word = f"Good: at most {REGRET:g} % regret and {STEADY:g} OD at rest"
+        word = f"Good: the regret is at most {REGRET:g} % and the steady error at most {STEADY:g} OD"
     return Headline(claim, items, f"{word}.")
 
 
 def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
-    from hardware.family import family, known  # and with it the plant, only where a deployment is reported
+    from hardware.family import family, known  # slow: imports the simulated plant, too
 
     windows: Sequence[Summary] = summary["windows"]
     backend = config["backend"]["kind"]
@@ -82,16 +84,16 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Headline:
     )
     steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
     items = [f"fresh medium {number(summary['volume_ml'])} mL"]
-    items += [f"interlock spoke in {count(sum(r['interlock'] for r in summary['reactors'].values()), 'sample')}"]
+    items += [f"interlock alarms in {count(sum(r['interlock'] for r in summary['reactors'].values()), 'sample')}"]
     for signal in signals_in(windows):
         errors = [w[key] for w in windows if w.get(key := f"{signal}_abs_error_mean") is not None]
         if errors:
             said = number(float(np.mean(errors)))
-            items.append(f"mean error of the {CALLED.get(signal, signal)} {said}, as estimated")
+            items.append(f"mean error of the estimated {CALLED.get(signal, signal)} {said}")
     if not steady:
-        return Headline(claim, items, "No window was long enough to say how well its setpoint was held.")
+        return Headline(claim, items, "No window was long enough to judge how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
-    items.insert(0, f"largest error at rest {number(worst)} OD, the mean over the last 10 min of a window")
+    items.insert(0, f"largest steady error {number(worst)} OD (mean error in the last 10 min of a window)")
     held = sum(error <= BAND for error in steady)
     word = "Good" if held == len(windows) else "Not good"
     return Headline(claim, items, f"{word}: {held} of {len(windows)} windows ended within 5 % of their setpoint.")
@@ -115,16 +117,17 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
         f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
         f"{number(summary['doubling_min'])} min",
         f"tau {number(tau[0])}, 95 % interval {number(tau[1])} to {number(tau[2])}",
-        f"PMSE {number(summary['pmse_pct'])} % of the squared OD; {summary['n_used']} readings used, "
+        f"PMSE {number(summary['pmse_pct'])} % (squared residual / squared OD); {summary['n_used']} readings used, "
         f"{summary['n_rejected']} rejected",
     ]
     items += [
-        f"the first half predicts the second {a['minutes']:.0f} min ahead within {number(a['model_pct'], 2)} % rms "
-        f"(the OD stays {number(a['od_stays_pct'], 2)} %, the slope goes on {number(a['same_slope_pct'], 2)} %)"
+        f"the fit to the first half predicts the second half {a['minutes']:.0f} min ahead with an rms error of "
+        f"{number(a['model_pct'], 2)} % (assuming constant OD: {number(a['od_stays_pct'], 2)} %, constant slope: "
+        f"{number(a['same_slope_pct'], 2)} %)"
         for a in summary.get("validation", {}).get("ahead", ())
     ]
     against = "; ".join(summary["warnings"])
-    return Headline(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")
+    return Headline(claim, items, f"Warnings: {against}." if against else "Good: no warnings.")
 
 
 def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
@@ -132,25 +135,31 @@ def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
     claim = f"Certificate of a policy for {', '.join(summary['observation'])}."
     unsafe = not all(check["holds"] for check in checks if check["kind"] == "safety")
     failed = [check["name"] for check in sorted(checks, key=lambda c: c["kind"] != "safety") if not check["holds"]]
-    items = [f"{len(checks)} requirements were judged, listed below", *(f"fails: {name}" for name in failed[:SHOWN])]
-    items += [f"and {len(failed) - SHOWN} more fail"] * (len(failed) > SHOWN)
+    items = [f"{len(checks)} requirements were checked, listed below", *(f"failed: {name}" for name in failed[:SHOWN])]
+    items += [f"{len(failed) - SHOWN} more failed"] * (len(failed) > SHOWN)
     if not failed:
-        return Headline(claim, items, "Good: safe, and every requirement of performance is met.")
-    said = "Not safe: a device refuses it" if unsafe else "Safe: a device runs it, but its performance falls short"
-    return Headline(claim, items, f"{said}. What helps: {REMEDY}.")
+        return Headline(claim, items, "Good: the policy is safe and meets every performance requirement.")
+    said = (
+        "Not safe: devices refuse this policy"
+        if unsafe
+        else "Safe: devices accept this policy. Its performance is insufficient"
+    )
+    return Headline(claim, items, f"{said}. Remedy: {REMEDY}.")
 
 
 def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
     inside, doses, twin = summary["inside_pct"], summary["doses_pct"], summary["twin"]
     data = Path(config["data"]).name if config.get("data") else "the shipped recording"
-    claim = f"Replay of {data}: {number(inside['one'])} % of the readings lay inside their 95 % band, and "
-    claim += f"{number(inside['ten'])} % inside that of {summary['ahead']} readings before."
+    claim = (
+        f"Replay of {data}: {number(inside['one'])} % of the readings lay inside the 95 % band predicted one reading "
+    )
+    claim += f"ahead, and {number(inside['ten'])} % inside that predicted {summary['ahead']} readings ahead."
     items = [f"{name} {number(low)} to {number(high)}" for name, (low, high) in _spreads(summary)]
     items += [
-        f"doses at OD {number(summary['setpoint'])}: both {doses['both']:.0f} % of readings, neither "
-        f"{doses['neither']:.0f} %, the device alone {doses['device']:.0f} %, the controller alone "
-        f"{doses['controller']:.0f} %",
-        f"not believed {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
+        f"doses at setpoint OD {number(summary['setpoint'])}, in % of readings: device and controller "
+        f"{doses['both']:.0f}, neither {doses['neither']:.0f}, only device {doses['device']:.0f}, only controller "
+        f"{doses['controller']:.0f}",
+        f"rejected {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
         "interlock alarms: " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
     ]
     if "none" in twin:
@@ -160,7 +169,7 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
 
 
 def _spreads(summary: Summary) -> list[tuple[str, tuple[float, float]]]:
-    """Growth rate, and the pump's flow in per cent of its setting; nothing that no estimator knew."""
+    """Return label and range of the estimates: growth rate; pump flow, % of its setting. Unknown ones are left out."""
     scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("pump, % of its setting,", 100.0)}
     known = [(name, scale, summary[key]) for key, (name, scale) in scales.items() if summary[key] is not None]
     return [(name, (scale * low, scale * high)) for name, scale, (low, high) in known]

@@ -174,7 +174,7 @@ def test_each_seed_of_a_folder_of_policies_is_a_row(tmp_path):
     assert [c for c in wide.studies["robust"].controllers if "adaptive_seed" in c] == names
     assert "dqn_adaptive" not in wide.studies["robust"].controllers
     assert [wide.policies[name] for name in names] == [str(tmp_path / f"seed{seed:04d}.npz") for seed in (0, 3)]
-    with pytest.raises(frame.UserError, match=r"policies\.pi: .*allowed dqn, dqn_paper, dqn_adap"):
+    with pytest.raises(frame.UserError, match=r"policies\.pi: .*dqn, dqn_paper, dqn_adap"):
         with_seeds(replace(asked, policies={"pi": str(tmp_path)}))
 
 

@@ -142,12 +142,12 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
     out = section()
     page._beside_paper(out, summary)
     (said,) = [content for _, blocks in out.sections for kind, content in blocks if kind == "verdict"]
-    assert [word for word in said["claim"].replace(",", "").split() if word.isdigit()][:3] == ["6", "3", "2"]
+    assert [word for word in said["claim"].replace(",", "").split() if word.isdigit()][:3] == ["3", "6", "2"]
     assert len(said["items"]) == 4
     assert all(part in said["items"][0] for part in ("OD 0.8", "ISE", "dqn 0.05", "mpc 0.03"))
     each = [item.split(" minus dqn: ")[1].split(",")[0] for item in said["items"]]
     assert each == ["-0.015", "-0.015", "-0.012", "-0.018"]
-    assert ["holds 0" in item for item in said["items"]] == [False, False, False, True]
+    assert ["includes 0" in item for item in said["items"]] == [False, False, False, True]
 
 
 def texts(out: Page) -> list[str]:
@@ -217,12 +217,13 @@ def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law() 
     said = {table.title: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
     columns = ("plant", "dqn_adaptive")
     assert said == {
-        "Decisions in which e lay within two of its sd of the true value, %":
+        "Decisions with the true error e within 2 sd of its estimate, %":
             (columns, [("bench", "91"), ("nominal", "45.5")]),
-        "Decisions in which s lay within two of its sd of the share at rest, %":
+        "Decisions with the true growth share s within 2 sd of its estimate, %":
             (columns, [("bench", "83"), ("nominal", "41.5")]),
         "Decisions by the supervisor's controller, %": (columns, [("bench", "12"), ("nominal", "6")]),
-        "Of these, because of innovations, %": (columns, [("bench", "4"), ("nominal", "2")]),
+        "Decisions by the supervisor's controller because of innovations, %":
+            (columns, [("bench", "4"), ("nominal", "2")]),
     }  # fmt: skip
 
 
@@ -296,7 +297,8 @@ def test_the_settling_time_beside_the_paper_s_is_that_of_the_policy_in_the_regul
     out = Page("", "")
     page._density(out, summary, tmp_path)
     assert texts(out) == [
-        "Settling at 0.5 from 0.7: 12.5 min (median of 5; paper: 10 min on average, start and band not stated)."
+        "Settling time from 0.7 to 0.5: 12.5 min (median of 5 replicates; "
+        "paper: 10 min on average, start and band not stated)."
     ]
 
 

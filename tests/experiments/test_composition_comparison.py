@@ -281,7 +281,7 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
         "composition_sine_laws": "sine: every law and plant", "composition_sine_shares": "sine: shares on two",
     }  # fmt: skip
     curves = {key: drawn[f"composition_{key}_shares"].figure.axes for key in ("steps", "sine")}
-    told = ["pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum, told ahead"]
+    told = ["pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum, with preview"]
     assert [ax.get_title() for ax in curves["steps"][:6]] == told
     assert [float(ax.lines[0].get_ydata()[0]) for ax in curves["steps"][6:]] == [30.0, 32.0, 33.0, 34.0, 35.0, 36.0]
     assert [ax.get_title() for ax in curves["sine"][:2]] == ["receding", "pi"]

@@ -298,7 +298,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (0, "line 2: M1", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
         (0, "step 3", H, "OD", LATER / 60, np.full(12, 0.9)),
         (0, "line 4", H, "OD", [0.75, 0.75], [0, 1]),
-        (0, "line 5: not believed", H, "OD", HOURS, np.full(12, np.nan)),
+        (0, "line 5: rejected reading", H, "OD", HOURS, np.full(12, np.nan)),
         (0, "line 6", H, "OD", LATER / 60, np.where(MINUTES == 90.0, 2 * OD, np.nan)),
         (1, "step 0", H, PUMP, HOURS, FED),
         (1, "step 1", H, PUMP, LATER / 60, TWICE),
@@ -364,9 +364,9 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (2, "line 0", H, "OD", HOURS, np.where(MINUTES == 30.0, np.nan, OD)),
     ]),
     "coverage": (coverage, [
-        (0, "line 0", SORTED, "growth rate µ over its truth", [0, 1, 2], [0.8, 1.0, 1.2]),
-        (0, "stick", SORTED, "growth rate µ over its truth", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
-        (1, "stick", SORTED, "dilution constant τ over its truth", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
+        (0, "line 0", SORTED, "growth rate µ / true value", [0, 1, 2], [0.8, 1.0, 1.2]),
+        (0, "stick", SORTED, "growth rate µ / true value", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
+        (1, "stick", SORTED, "dilution constant τ / true value", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
     ]),
     "pair": (two, [
         (0, "line 0: E. coli", WARM, "growth rate, 1/h", WARMTH, 0.07727 * WARMTH - 1.66954),
@@ -599,7 +599,7 @@ def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
     told = replace(one, cell=ShareCell("midpoint", "p", "s"), foresight=True, share=one.share + 0.3)
     told = replace(told, temperature=one.temperature + 2.0, setpoint=one.setpoint + 0.3)
     axes = comparison.shares([told, one]).axes
-    assert [ax.get_title() for ax in axes] == ["midpoint, told ahead", "pi", "", ""]
+    assert [ax.get_title() for ax in axes] == ["midpoint, with preview", "pi", "", ""]
     assert [float(ax.lines[0].get_ydata()[0]) for ax in axes] == pytest.approx([0.6, 0.3, 33.0, 31.0])
     assert [float(ax.lines[1].get_ydata()[0]) for ax in axes[:2]] == pytest.approx([0.65, 0.35])
 
@@ -618,7 +618,7 @@ def test_errors_of_a_share_have_the_mark_of_their_law_in_the_row_of_their_plant(
     (ax,) = drawn.axes
     assert [text.get_text() for text in ax.get_yticklabels()] == ["wide", "narrow"]
     marks = legend(drawn)
-    assert list(marks) == ["pi", "midpoint", "midpoint, told ahead"]
+    assert list(marks) == ["pi", "midpoint", "midpoint, with preview"]
     assert len(set(marks.values())) == 3
     pi, midpoint, told = marks.values()
     assert dots(ax) == {
@@ -691,7 +691,11 @@ def test_a_calibration_tells_in_numbers_what_its_figures_show() -> None:
     ("relative", "said", "title"),
     [
         (False, (MIN, "OD", PUMP), "setpoint {:g}"),
-        (True, ("control periods", f"error e, {PERIODS}", "dose, share of full pump"), "growth takes {:g} of the pump"),
+        (
+            True,
+            ("control periods", f"error e, {PERIODS}", "dose, fraction of full pump"),
+            "growth takes {:g} of the pump",
+        ),
     ],
 )
 def test_example_loops_stand_in_the_column_of_their_goal_with_the_optimum_from_the_same_start(relative, said, title):
@@ -731,7 +735,7 @@ def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_valu
         (charts.policy_map, 1000.0, 0.03, 30.0, ("OD x", "setpoint, OD", PUMP)),
         (charts.policy_map, 1000.0, 0.015, 20.0, ("OD x", "setpoint, OD", PUMP)),
         (charts.relative_map, 1.0, 0.5, 1.0,
-         (f"error e, {PERIODS}", "growth's share of the pump, s", "dose, share of full pump")),
+         (f"error e, {PERIODS}", "growth share s", "dose, fraction of full pump")),
     ],
 )  # fmt: skip
 def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale(draw, unit, most, end, said):

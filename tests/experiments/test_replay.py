@@ -97,4 +97,4 @@ def test_the_page_opens_with_the_answer(tmp_path: Path) -> None:
     assert sum(summary["doses_pct"].values()) == pytest.approx(100.0)
     assert summary["twin"]["mean_abs_error"] < 0.02
     page = (tmp_path / "report.html").read_text()
-    assert page.index("inside their 95 % band") < page.index("<img")
+    assert page.index("95 % band") < page.index("<img")

@@ -151,7 +151,7 @@ def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
         "ISE of the noise-free OD (OD² min), sum over the windows": "5",
         "ITAE of the noise-free OD (OD min²), sum over the windows": "6", "Steady error of the noise-free OD": "7",
         "Control effort (µL/s per decision)": "8", "Fresh medium used (mL per vial)": "9",
-        "Samples on which the interlock allowed no dose, per vial": "10",
+        "Samples after which the interlock allowed no dose, per vial": "10",
     }  # fmt: skip
     assert {table.columns[:3] for table in page.tables} == {("plant", "a", "b")}
     for key, law in zip(RANKED, LAWS, strict=True):
@@ -188,9 +188,9 @@ def test_in_short_the_lowest_of_each_plant_is_named_and_the_oracle_is_not():
     page = one_section()
     comparison._in_short(page, {"beside_paper": [], "totals": totals, "rows": rows})
     text = page.html()
-    assert "<h2>In short</h2>" in text
+    assert "<h2>Summary</h2>" in text
     assert "<li>density on p: mpc 8.5, then dqn 9</li>" in text
-    assert "<li>share on p: midpoint, told ahead 0.04, then pi 0.045</li>" in text
+    assert "<li>share on p: midpoint, with preview 0.04, then pi 0.045</li>" in text
     assert "Lowest mean |r - setpoint| and ITAE, OD min², mean of the replicates:" in text
 
 
@@ -360,10 +360,10 @@ def test_each_run_of_a_folder_has_its_own_seed_command_figures_and_tables(tmp_pa
         charts.save(figure(), run / "figures", f"drawn_{k}")
     text = report.write(tmp_path / "both").read_text(encoding="utf-8")
     sections = dict(re.findall(r"<h2>([^<]+)</h2>(.*?)</section>", text, re.DOTALL))
-    assert list(sections) == [f"{k}_train: {what}" for k in (1, 2) for what in ("results", "what was run")]
+    assert list(sections) == [f"{k}_train: {what}" for k in (1, 2) for what in ("results", "command and configuration")]
     for k in (0, 1):
         assert re.findall(r"drawn \d", sections[f"{k + 1}_train: results"]) == [f"drawn {k}"] * 2
-        ran = dict(re.findall(r"<tr><th>([^<]+)</th><td>([^<]*)</td>", sections[f"{k + 1}_train: what was run"]))
+        ran = dict(re.findall(r"<tr><th>([^<]+)</th><td>([^<]*)</td>", list(sections.values())[2 * k + 1]))
         assert (ran["seed"], ran["overrides"], ran["run folder"]) == (
             str(40 + k), f"env.mu=0.0{k + 2}", f"{k + 1}_train",
         )  # fmt: skip
@@ -544,7 +544,7 @@ def test_several_runs_begin_with_what_each_came_to(tmp_path):
         found = {"cannot_hold": [], "observation": [name], "passed": passed, "checks": checks}
         run_folder(tmp_path / "both" / name, found)
     text = report.write(tmp_path / "both").read_text(encoding="utf-8")
-    short = text[text.index("<h2>In short") : text.index("<h2>First: results")]
+    short = text[text.index("<h2>Summary") : text.index("<h2>First: results")]
     assert re.findall("for 1_first|for 2_second|Good: |Not safe: ", short) == [
         "for 1_first", "Good: ", "for 2_second", "Not safe: ",
     ]  # fmt: skip

@@ -104,7 +104,7 @@ def test_every_curve_has_the_unit_that_the_page_gives_it() -> None:
     explained = dict(ROW.findall(PAGE.read_text(encoding="utf-8")))
     assert {tag: re.split(" for |; ", CURVES[tag].unit)[0] for tag in explained} == explained
     assert described("culture/od") == "optical density as measured. Unit: OD."
-    assert described("eval/regret_pct/min").endswith("selection grid. Unit: %. Lowest agent.")
+    assert described("eval/regret_pct/min").endswith(". Unit: %. Lowest agent.")
     assert described("eval/regret_pct/iqm").endswith("Mean of the middle half of the agents.")
 
 

@@ -147,7 +147,7 @@ def test_time_series_show_a_card_with_a_line_for_each_tag(address: str, browser:
 
 
 def test_custom_scalars_show_learning_against_its_limits(address: str, browser: Any) -> None:
-    titles = ("Regret of the greedy policy, its limit, %", "Error at rest at the worst setpoint, its limit", "Loss",
+    titles = ("Regret of the greedy policy, its limit, %", "Steady error at the worst setpoint, its limit", "Loss",
               "Q values", "Exploration, share of random actions", "Reward per episode")  # fmt: skip
     page = show(
         browser,

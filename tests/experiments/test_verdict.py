@@ -80,11 +80,11 @@ def test_a_deployment_of_two_species_says_its_error():
     """Three windows of unlike errors, in one of which no share was asked for."""
     windows = [{**WINDOW, "ratio_setpoint": 0.5, "ratio_abs_error_mean": error} for error in (0.02, None, 0.05)]
     said = verdict(DEPLOYED | {"windows": windows}, LOOP)
-    assert said.items[3:] == ["mean error of the share 0.035, as estimated"]
+    assert said.items[3:] == ["mean error of the estimated share 0.035"]
     short = [{**WINDOW, "steady_abs_error": None}]
     said = verdict(DEPLOYED | {"windows": short}, LOOP)
-    assert said.items == ["fresh medium 65 mL", "interlock spoke in 3 samples"]
-    assert said.remark == "No window was long enough to say how well its setpoint was held."
+    assert said.items == ["fresh medium 65 mL", "interlock alarms in 3 samples"]
+    assert said.remark == "No window was long enough to judge how well its setpoint was held."
 
 
 def test_a_certificate_says_what_fails_and_what_helps():
@@ -94,7 +94,7 @@ def test_a_certificate_says_what_fails_and_what_helps():
     summary = {"cannot_hold": [], "observation": ["e", "s"], "passed": False, "checks": checks}
     said = verdict(summary, {})
     assert said.items == [
-        "6 requirements were judged, listed below", "fails: no. 3", "fails: no. 4", "fails: no. 0", "and 2 more fail",
+        "6 requirements were checked, listed below", "failed: no. 3", "failed: no. 4", "failed: no. 0", "2 more failed",
     ]  # fmt: skip
     short, good = (verdict(summary | {"checks": some}, {}).remark for some in (checks[:3], checks[1:2]))
     assert [remark.split(" ")[0] for remark in (said.remark, short, good)] == ["Not", "Safe:", "Good:"]
