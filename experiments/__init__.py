@@ -1,6 +1,6 @@
-"""Commands and their rooms.
+"""Commands, one file each, and the packages that they use.
 
-A file directly in this folder is a command, `python -m experiments.NAME`, and is not imported.
+A file directly in this folder is a command, `python -m experiments.NAME`. No other module imports it.
 """
 
 from experiments.cli.start import begin

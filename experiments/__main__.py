@@ -1,4 +1,4 @@
-"""The program `python -m experiments` or `turbidostat`: list of commands, and entry to each."""
+"""Program `turbidostat`, or `python -m experiments`: list the commands, or run one of them."""
 
 import importlib
 import sys
@@ -12,29 +12,29 @@ from experiments.cli.start import version
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "replay", "train", "certify", "deploy", "report"),
     "At the device": ("calibrate_pump", "blank", "mark", "calibrate_pair"),
-    "Side by side": ("benchmark", "score"),
+    "Comparisons": ("benchmark", "score"),
 }
-DEMO = "The whole way in one command: calibrate, train, deploy, report."
+DEMO = "All steps in one command: calibrate, train, certify, deploy, report."
 USAGE = """\
 usage: turbidostat COMMAND [key=value ...]     the same as  python -m experiments.COMMAND [key=value ...]
 """
 END = """\
-turbidostat COMMAND --help     what a command takes; --help=all with every value, unit, range and default
-turbidostat COMMAND --cfg job  the config it would run with
-turbidostat --version          which version this is
+turbidostat COMMAND --help     arguments of a command; --help=all lists every value with unit, range and default
+turbidostat COMMAND --cfg job  the config that the command would use; nothing runs
+turbidostat --version          version of this program
 
-An emulated Chi.Bio is started by  python -m hardware.emulator --help
+How to start an emulated Chi.Bio:  python -m hardware.emulator --help
 
 Exit codes
   0    done
-  1    refused or failed; one line on standard error says why and what to do
+  1    refused or failed; one line on standard error gives the reason and the remedy
   2    no such command
-  130  stopped by Ctrl-C, SIGTERM or SIGHUP; one line says what is kept and how to go on;
-       a deployment that was stopped ends with 0, once its pumps are verified off"""
+  130  stopped by Ctrl-C, SIGTERM or SIGHUP; one line lists the files kept and how to continue;
+       a stopped deployment exits with 0 after its pumps are verified off"""
 
 
 def names() -> list[str]:
-    """Return all commands, in listed order."""
+    """Return the names of all commands in the order of the list."""
     listed = [name for group in KINDS.values() for name in group]
     return [*listed, *(name for name in commands() if name not in listed)]
 
@@ -44,7 +44,7 @@ def _line(name: str, what: str) -> str:
 
 
 def page() -> Iterator[str]:
-    """Describe all commands, line by line, for a call without a command."""
+    """Yield the lines that describe all commands, for a call without a command."""
     yield USAGE
     others = tuple(name for name in names() if not any(name in group for group in KINDS.values()))
     for kind, group in {**KINDS, **({"Others": others} if others else {})}.items():
@@ -55,7 +55,7 @@ def page() -> Iterator[str]:
 
 
 def main() -> None:
-    """Entry point of the console script. Exits: as the command does; 2 for an unknown command."""
+    """Run the command of the console script. Exits: with the command's status; 2 for an unknown command."""
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h", "help"):
         print("\n".join(page()))
@@ -66,7 +66,7 @@ def main() -> None:
         importlib.import_module(f"experiments.{name}").main()
     else:
         near = get_close_matches(name, names(), 1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names())}"
+        hint = f"did you mean {near[0]}?" if near else f"the commands are {', '.join(names())}"
         print(f"error: {name}: no such command; {hint}", file=sys.stderr)
         sys.exit(2)
 

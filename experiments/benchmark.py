@@ -7,8 +7,8 @@ from experiments.comparison.config import BenchmarkConfig
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
-    """Calibrate, train, run every closed loop, compare, draw, report."""
-    from experiments.comparison import run  # Matplotlib and SciPy, only after the check of the config
+    """Calibrate and train, run every closed loop, compare the results, draw and report them."""
+    from experiments.comparison import run  # loads Matplotlib and SciPy, so only after the config is checked
 
     run.benchmark(config, folder)
 

@@ -34,9 +34,9 @@ class BlankConfig:
 
 
 def blank(config: BlankConfig, folder: Path) -> None:
-    """Stir clear medium, heat it, average its counts, set them as blanks, store them. Raises: UserError."""
+    """Stir and heat clear medium, average its counts, set the averages as blanks, store them. Raises: UserError."""
     backend = replace(config.backend, reactors=(config.reactor,)) if config.reactor else config.backend
-    what = "clear medium in %s: to %g degC first, then %d minutes"
+    what = "clear medium in %s: heating to %g degC, then measuring for %d minutes"
     log.info(what, ", ".join(backend.reactors), backend.temperature, config.samples + 1)
     with frame.refusing(ReactorError):
         with one_interrupt(), linked(backend) as (transport, clock):

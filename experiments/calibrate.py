@@ -1,6 +1,6 @@
-"""Fit one trustworthy pair (mu, tau) to a recording, as a model file for `train`: `python -m experiments.calibrate`.
+"""Fit mu and tau to a recording and write a model file for `train`: `python -m experiments.calibrate`.
 
-Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
+`generate=true` simulates a recording of the paper's open-loop protocol instead. `coverage=N` studies the intervals.
 """
 
 from contextlib import closing
@@ -45,7 +45,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     read = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
     raw = merged(read)
     if raw is not read:
-        merging = f"{len(read.time)} rows merged into {len(raw.time)} of a minute or more"
+        merging = f"{len(read.time)} rows merged into {len(raw.time)} rows, each of a minute or more"
         recording = replace(recording, notes=(*recording.notes, merging))
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
@@ -65,7 +65,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     try:
         environment.write_text(environment_yaml(result, name), encoding="utf-8")
     except ValueError as error:
-        raise frame.UserError(f"{source}: no model to train on: {error}; {folder}/summary.json has the fit") from None
+        raise frame.UserError(f"{source}: no training model: {error}; the fit is in {folder}/summary.json") from None
     behind = twin(raw, result, config.identify.segment_min)
     written = _write_twin(folder / "twin.yaml", behind, name)
     _draw(folder, raw, result, behind, name, config.identify.segment_min)
@@ -74,12 +74,12 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     for what in content["rejected"]:
         print(f"  rejected rows {what['rows']} ({what['n']}): {what['reason']}")
     print("\n".join(f"  {note}" for note in recording.notes), f"files {environment}, {written}", sep="\n")
-    print(f"next, all of it on one page: python -m experiments.report run={folder}")
+    print(f"next, for a page with all results: python -m experiments.report run={folder}")
     return result.pmse_pct
 
 
 def _write_twin(path: Path, behind: Twin, source: str) -> str:
-    """Write the plant; return a message about it. Some recordings are out of range for a plant."""
+    """Write the plant; return its path, or a message if the recording has values that no plant may have."""
     try:
         text = twin_yaml(behind, source)
     except ValueError as error:
@@ -95,8 +95,8 @@ def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: st
 
     figures = {
         "fit": fit_figure(raw, result, f"{name}: measured and model"),
-        "drift": drift_figure(result, f"{name}: segments of about {segment_min:g} min, fitted alone"),
-        "twin": twin_figure(raw, result, behind, f"{name}: its twin"),
+        "drift": drift_figure(result, f"{name}: each segment of about {segment_min:g} min fitted alone"),
+        "twin": twin_figure(raw, result, behind, f"{name}: recording and twin"),
     }
     with closing(Events(folder)) as events:
         results = {"mu_per_min": result.mu.value, "tau": result.tau.value, "pmse_pct": result.pmse_pct}
@@ -112,7 +112,7 @@ def _generate(config: CalibrateConfig, folder: Path) -> None:
     protocol = config.protocol
     path = Path(config.out) if config.out else folder / f"{config.law}.csv"
     if path.exists():
-        raise frame.UserError(f"out={path}: exists; remove it or choose another file")
+        raise frame.UserError(f"out={path}: this file exists; remove it or choose another file")
     time, od, pump_rate, _ = simulated(config, 1)
     with frame.refusing(RecordingError), Recorder(path, COLUMNS, fsync=False) as recorder:
         for t, y, u in zip(time, od[0], pump_rate[0], strict=True):

@@ -1,6 +1,6 @@
-"""Fit growth curves and pigment: `python -m experiments.calibrate_pair 'first=[A.csv]' 'second=[B.csv]'`.
+"""Fit growth curves and pigment of a pair: `python -m experiments.calibrate_pair 'first=[A.csv]' 'second=[B.csv]'`.
 
-Each species is recorded alone, at three temperatures or more. A mixed run with counted shares corrects both curves.
+Record each species alone, at three or more temperatures. A mixed run with marked shares corrects both curves.
 """
 
 import logging
@@ -25,14 +25,14 @@ from hardware.storage.marks import read_marks
 
 log = logging.getLogger(__name__)
 
-FEWEST = 3  # temperatures of a curve
-LAGS = 4.0  # of a species' own after a change of temperature: 2 % of it are left
-STRAY = 0.02  # sd of a growth rate over its value, beyond that of its recording: cultures differ
+FEWEST = 3  # temperatures that a curve needs
+LAGS = 4.0  # time constants to wait after a change of temperature: 2 % of the change is then left
+STRAY = 0.02  # relative sd of growth rates between cultures, added to the sd from the recording
 
 
 @dataclass(frozen=True)
 class CalibratePairConfig:
-    """Which recordings. Raises: ValueError naming key, value and allowed range."""
+    """Config of a calibration of two species. Raises: ValueError with key, value and allowed range."""
 
     first: tuple[str, ...] = setting((), "recordings of the first species alone, at several temperatures")
     second: tuple[str, ...] = setting((), "recordings of the second species, whose pigment is measured")
@@ -40,42 +40,40 @@ class CalibratePairConfig:
     mixed: str | None = setting(
         None, "recording of a deployment with both; the marked shares of its run correct both curves"
     )
-    pump_ml_s: float = setting(0.02, "mL/s of a pump rate of 1 in a Chi.Bio's own CSV", "mL/s", above=0.0, at_most=1.0)
+    pump_ml_s: float = setting(0.02, "flow at pump rate 1 in a Chi.Bio's own CSV", "mL/s", above=0.0, at_most=1.0)
     volume_ml: float = setting(Bench.volume_ml, "culture volume of all these recordings", "mL", within=(1, 2000))
-    degree: int = setting(2, "degree of both curves, less with fewer temperatures", within=(1, 4))
+    degree: int = setting(2, "polynomial degree of both curves; lowered for few temperatures", within=(1, 4))
     settle_min: float = setting(
-        120.0, "ignored after a change of temperature; at least four lags", "min", within=(0, 600)
+        120.0, "time ignored after a change of temperature; at least four times lags_min", "min", within=(0, 600)
     )
-    least_min: float = setting(60.0, "shortest time after that at one temperature", "min", within=(30, 2000))
+    least_min: float = setting(60.0, "shortest time at one temperature after settle_min", "min", within=(30, 2000))
     lags_min: tuple[float, ...] = setting((2.0, 60.0), "time constants of growth after a change of temperature", "min")
-    factor: float = setting(0.99, "k of the light k (pigment + od_term OD) + offset", within=(0.05, 20))
+    factor: float = setting(0.99, "factor of light = factor (pigment + od_term OD) + offset", within=(0.05, 20))
     offset: float = setting(214.0, "offset of the light", "counts", within=(0, 20_000))
-    od_term: float = setting(150.0, "light that cells of any kind scatter", "counts/OD", within=(0, 5000))
+    od_term: float = setting(150.0, "light scattered by cells of both species", "counts/OD", within=(0, 5000))
 
     def __post_init__(self) -> None:
         check(self)
         for key in ("names", "lags_min"):
-            require(
-                len(getattr(self, key)) == 2, key, getattr(self, key), "two, of the first and of the second species"
-            )
-        require(self.names[0] != self.names[1], "names", self.names, "two that differ")
+            require(len(getattr(self, key)) == 2, key, getattr(self, key), "two values, one for each species")
+        require(self.names[0] != self.names[1], "names", self.names, "two different names")
         first, second = self.lags_min
-        require(0.0 <= first <= second <= 600.0, "lags_min", self.lags_min, "two of 0 to 600 min, the first not longer")
+        require(0.0 <= first <= second <= 600.0, "lags_min", self.lags_min, "0 to 600 min, the smaller one first")
 
 
 def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfig) -> list[Plateau]:
-    """Of all recordings of a species, in order of temperature. Raises: UserError for one without temperatures."""
+    """List the plateaus of a species by temperature. Raises: UserError for a recording without temperatures."""
     settle_min = max(config.settle_min, LAGS * lag_min)
     found: list[Plateau] = []
     for path in paths:
         with frame.refusing(ValueError, RecordingError):
             r = read_recording(path, pump_ml_s=config.pump_ml_s)
         if not np.isfinite(r.temperature).any():
-            raise frame.UserError(f"{path}: no temperature in it; give a recording with a column temperature_degc")
+            raise frame.UserError(f"{path}: no temperatures; give a recording with a column temperature_degc")
         low, high = np.nanmin(r.temperature), np.nanmax(r.temperature)
         if not 4.0 <= low <= high <= 60.0:
             raise frame.UserError(
-                f"{path}: temperatures of {low:g} to {high:g}: allowed 4 to 60 degC; are they in degC?"
+                f"{path}: temperatures from {low:g} to {high:g}: allowed 4 to 60 degC; check that the unit is degC"
             )
         series = Series(r.time_min, r.od, r.pump_rate, r.row)
         mine, left = curves.plateaus(
@@ -83,7 +81,7 @@ def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfi
         )
         log.info("%s: %d temperature(s) held long enough", path, len(mine))
         for line in left:
-            log.warning("%s: left out: %s", path, line)
+            log.warning("%s: ignored: %s", path, line)
         found += mine
     return sorted(found, key=lambda p: p.temperature)
 
@@ -94,30 +92,28 @@ def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibrateP
     if apart < FEWEST:
         minutes = max(config.settle_min, LAGS * lag_min) + config.least_min
         raise frame.UserError(
-            f"{name}: growth at {apart} temperature(s); record {FEWEST} at least, each held for {minutes:g} min behind "
+            f"{name}: growth at {apart} temperature(s); record at least {FEWEST}, each held for {minutes:g} min after "
             "the change, or lower settle_min or least_min"
         )
     if apart <= config.degree + 1:
-        log.warning("%s: a curve through all of its %d points: its error is unknown; record more", name, apart)
+        log.warning("%s: the curve meets all %d points: its error is unknown; record more temperatures", name, apart)
     value = np.array([p.growth.value for p in points])
     sd = np.hypot([p.growth.half_width / 1.96 for p in points], STRAY * value)
     return curves.fit(t, value, sd, min(config.degree, apart - 1))
 
 
 def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfig:
-    """Production of pigment in balance with dilution: g_ss = mu ((light - offset) / (k OD) - od_term).
+    """Fit the production of pigment, which balances dilution: g_ss = mu ((light - offset) / (k OD) - od_term).
 
-    Raises: UserError where no recording of the second species has light.
+    Raises: UserError if no recording of the second species has fluorescence, or if it is too low.
     """
     lit = [(p, p.light.value) for p in points if p.light is not None]
     if not lit:
         where = ", ".join(config.second)
         raise frame.UserError(f"second={where}: the recording has no fluorescence; record with backend.fluorescence")
     if dark := [p for p, light in lit if light <= 0.0]:
-        at = f"second: light at {dark[0].temperature:.1f} degC is no more than offset={config.offset:g} counts"
-        raise frame.UserError(
-            f"{at}; are these recordings of the second species, and is that the offset of this sensor?"
-        )
+        at = f"second: light at {dark[0].temperature:.1f} degC is not above offset={config.offset:g} counts"
+        raise frame.UserError(f"{at}; check that these are recordings of the second species, and the sensor's offset")
     t, growth, light = np.array([(p.temperature, p.growth.value, light) for p, light in lit]).T
     made = np.maximum(light / config.factor - config.od_term, 0.0) * growth
     degree, centre = min(4, np.unique(np.round(t)).size - 1), float(np.round(t.mean(), 1))
@@ -126,10 +122,10 @@ def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfi
 
 
 def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfig, dict[str, float]]:
-    """Both curves times what a mixed run says of them, and these two factors less 1 with their sds.
+    """Correct both growth curves by a mixed run; return the pair, and the two relative corrections with their sds.
 
-    The estimator takes the run from its beginning, with every share that was marked. Raises: UserError for a run
-    without any.
+    The estimator replays the run from its beginning, with every marked share. Raises: UserError for a run without
+    marked shares.
     """
     assert config.mixed is not None
     path = Path(config.mixed)
@@ -140,7 +136,7 @@ def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfi
     if not marks:
         how = f"python -m experiments.mark run={run} reactor={name} share=SHARE sd=SD minute=MINUTE"
         raise frame.UserError(f"mixed={path}: no marked share for {name} in {run}; mark some: {how}")
-    guess = CompositionEstimatorConfig(  # the curves are those of this bench: of its thermometer, and of its pump
+    guess = CompositionEstimatorConfig(  # this bench's thermometer and pump also measured the curves: no error between
         factor=config.factor, offset=config.offset, od_term=config.od_term, thermometer_sd=0.0, gain_sd=0.01
     )
     estimator = CompositionEstimator(guess, config.volume_ml, pair)
@@ -164,10 +160,10 @@ def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfi
 
 
 def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
-    """Write pair.yaml, the figure and the summary. Raises: UserError where the recordings cannot tell a pair."""
+    """Write pair.yaml, the figure and the summary. Raises: UserError if the recordings do not determine a pair."""
     for key in ("first", "second"):
         if not getattr(config, key):
-            raise frame.UserError(f"{key}=[]: allowed one or more recordings of that species alone, {key}=[FILE.csv]")
+            raise frame.UserError(f"{key}=[]: give one or more recordings of that species alone, {key}=[FILE.csv]")
     lags = config.lags_min
     points = [_plateaus(paths, lag, config) for paths, lag in zip((config.first, config.second), lags, strict=True)]
     found = [_growth(name, mine, lag, config) for name, mine, lag in zip(config.names, points, lags, strict=True)]
@@ -177,7 +173,7 @@ def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
         each = " and ".join(
             f"{n} at {min(t):.1f} to {max(t):.1f} degC" for n, t in zip(config.names, every, strict=True)
         )
-        raise frame.UserError(f"recorded: {each}; allowed ranges that overlap: record both at the same temperatures")
+        raise frame.UserError(f"{each}: the temperatures must overlap; record both species at the same temperatures")
     with frame.refusing(ValueError):
         species = [
             SpeciesConfig(name, curve.coefficients, (), lag)
@@ -207,18 +203,18 @@ def _say(
     told: dict[str, float] | None, folder: Path,
 ) -> None:  # fmt: skip
     for name, mine, curve in zip(config.names, points, found, strict=True):
-        print(f"{name}: 1/h at degC, and its distance from the curve in sds")
+        print(f"{name}: temperature in degC, growth rate in 1/h (95 % interval), distance from the curve in sds")
         for p, off in zip(mine, curve.off, strict=True):
             light = "" if p.light is None else f"   light per OD {p.light.value:.0f}"
             between = f"{p.growth.low:.4f} to {p.growth.high:.4f}"
             print(f"  {p.temperature:6.2f}  {p.growth.value:.4f} ({between})  {off:+.1f}{light}")
     if told is not None:
         off = [f"{told[key]:+.3f} +- {told[f'{key}_sd']:.3f}" for key in ("first", "second")]
-        print(f"mixed: curves off by {' and '.join(off)}, corrected; they crossed at {told['even_c_alone']:.2f} degC")
+        print(f"mixed: curves corrected by {' and '.join(off)}; before, they met at {told['even_c_alone']:.2f} degC")
     low, high = pair.temperatures
     ends = pair.faster(np.array([low, high]))
-    print(f"both grow alike at {pair.even_c:.2f} degC; {pair.second.name} gains {ends[0]:+.3f} 1/h at {low:g} degC "
-          f"and {ends[1]:+.3f} at {high:g}")  # fmt: skip
+    print(f"both grow alike at {pair.even_c:.2f} degC; growth of {pair.second.name} minus {pair.first.name}: "
+          f"{ends[0]:+.3f} 1/h at {low:g} degC and {ends[1]:+.3f} 1/h at {high:g} degC")  # fmt: skip
     print(f"files {folder / 'pair.yaml'}, {folder / 'figures' / 'pair.png'}")
     print(f"next: python -m experiments.deploy scenario=ratio_steps pair={folder / 'pair.yaml'}")
 

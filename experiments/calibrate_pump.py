@@ -32,7 +32,7 @@ LIMITS = {"feed": 0.05, "waste": 0.5}
 
 @dataclass(frozen=True)
 class Weighing:
-    """One weighing: `doses` doses of 63 s * `duty` weighed `grams`."""
+    """One weighing. duty: on-time of each dose over 63 s. doses: number of doses. grams: mass of all doses together."""
 
     duty: float
     doses: int
@@ -48,10 +48,10 @@ class CalibratePumpConfig:
     pump: str = setting("feed", "pump to weigh", choices=tuple(PUMP_OF))
     duties: tuple[float, ...] = setting(
         (0.006, 0.01, 0.02, 0.04),
-        "on-times as fractions of 63 s, two or more, of the sizes that will be used: 0.003 to 0.05 (feed) or 0.5",
+        "on-times to weigh, as fractions of 63 s: two or more, 0.003 to 0.05 (feed) or to 0.5 (waste), as in later use",
     )
     doses: int = setting(20, "doses per weighing", within=(3, 200))
-    csv: str | None = setting(None, "existing weighings, columns duty,doses,grams; no pump runs then")
+    csv: str | None = setting(None, "file of existing weighings, columns duty,doses,grams; with it no pump runs")
 
     def __post_init__(self) -> None:
         check(self)
@@ -90,7 +90,7 @@ def _number(ask: Callable[[str], str], question: str) -> float:
                 return value
         except ValueError:
             pass
-        print(f"  {answer!r} is no mass in grams; a number from 0 to 10000, please")
+        print(f"  {answer!r} is not a mass in grams; type a number from 0 to 10000")
 
 
 def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tuple[list[Weighing], str]:
@@ -119,7 +119,7 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
 def report(fit: PumpFit, found: list[Weighing]) -> str:
     """Describe the fit for a person to judge."""
     c = fit.calibration
-    lines = [f"{'asked s':>8} {'doses':>6} {'mL/dose':>9} {'fitted':>9}"]
+    lines = [f"{'on, s':>8} {'doses':>6} {'mL/dose':>9} {'fitted':>9}"]
     lines += [
         f"{PERIOD_S * s.duty:8.3f} {s.doses:6d} {s.grams / s.doses:9.4f} {c.volume(PERIOD_S * s.duty):9.4f}"
         for s in found
@@ -134,7 +134,7 @@ def report(fit: PumpFit, found: list[Weighing]) -> str:
         lines.append(f"flow {c.flow_ml_s:.4f} mL/s, bias {c.bias_s:+.3f} s, {smallest}")
         lines.append(
             f"a line fits two series exactly, so the spread is unknown ({100.0 * c.spread:.0f} % is assumed): weigh a "
-            "third one with another duty (duties=[...], or all three with csv=FILE)"
+            "third series with another duty (duties=[...]), or give all three with csv=FILE"
         )
     return "\n".join(lines)
 

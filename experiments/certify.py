@@ -25,13 +25,13 @@ log = logging.getLogger(__name__)
 
 
 def body(config: CertifyConfig, folder: Path) -> None:
-    """Certify one policy. Raises: frame.UserError if it is unreadable, of an unknown kind, or not safe."""
+    """Certify one policy. Raises: frame.UserError if the policy is unreadable, of an unknown kind, or not safe."""
     source = find_policy(config.policy)
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
     to = _place(config, source)
     began = time.perf_counter()
-    log.info("proving the closed loop of %s, for every reading, setpoint and case; a minute or less", source)
+    log.info("proving the closed loop of %s for every reading, setpoint and case, in up to a minute", source)
     with frame.refusing(policies.PolicyError):
         policy = policies.load(source)
     with frame.refusing(ValueError, about=f"policy {source}: "):
@@ -43,25 +43,25 @@ def body(config: CertifyConfig, folder: Path) -> None:
     for line in found.told():
         log.info("%s", line)
     for line in found.cannot_hold():
-        log.info("said, not judged: %s", line)
+        log.info("reported, not judged: %s", line)
     unwritten = _write(folder, source, certificate.content(policy, beside, config, found), to, found)
     unsafe, short = (found.failed(kind) for kind in KINDS)
     if unsafe or short:
-        log.info("what helps: %s", REMEDY)
+        log.info("remedy: %s", REMEDY)
     if unsafe:
-        of = f"{len(unsafe)} of {sum(check.kind == SAFETY for check in found.checks)} requirements of safety fail"
-        raise frame.UserError(f"policy {source}: not safe, {of}, the first: {unsafe[0]}")
+        of = f"{len(unsafe)} of {sum(check.kind == SAFETY for check in found.checks)} safety requirements fail"
+        raise frame.UserError(f"policy {source}: not safe; {of}; the first is {unsafe[0]}")
     if short:
         told = "; ".join(map(str, worst(short)))
-        log.warning("policy %s: safe, a device runs it; its performance falls short: %s", source, told)
+        log.warning("policy %s: safe, so a device runs it; performance requirements not met: %s", source, told)
     else:
-        log.info("policy %s: safe, and every requirement of performance is met", source)
-    if unwritten and config.to:  # requested there
+        log.info("policy %s: safe, and every performance requirement is met", source)
+    if unwritten and config.to:  # the user asked for this file
         raise frame.UserError(unwritten)
 
 
 def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> str:
-    """Write the certificate, its other copy, summary, figure and page. Returns: the failed files."""
+    """Write the certificate, a copy to `to`, summary, figure and page. Returns: "", or why the copy failed."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
@@ -70,17 +70,17 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
     unwritten = ""
     if to is None:
         why = (
-            "a quick certificate is written only there"
+            "a quick certificate is not stored beside the policy"
             if found.quick
-            else f"{source} is part of the program, whose certificate stays"
+            else f"{source} is part of the program, whose certificate is kept"
         )
-        log.info("the certificate is in the run folder alone: %s; to=FILE also writes it elsewhere", why)
+        log.info("the certificate is only in the run folder: %s; to=FILE writes another copy", why)
     else:
         try:
             files.write_json(to, content, indent=None)
             log.info("certificate %s", to)
         except OSError as error:
-            unwritten = f"{to}: not written ({error.strerror}); {folder}/certificate.json is the same"
+            unwritten = f"{to}: not written ({error.strerror}); use {folder}/certificate.json, which is identical"
             log.warning("%s", unwritten)
     drawn = charts.save(figure(found), folder / "figures", "certificate")
     files.write_json(folder / "summary.json", _summary(source, content, found))
@@ -94,13 +94,13 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
 
 
 def _place(config: CertifyConfig, source: Path) -> Path | None:
-    """Return the certificate's place besides the run folder, if any. Raises: frame.UserError."""
+    """Return the path of the certificate's copy outside the run folder, if any. Raises: frame.UserError."""
     if config.to is None:
         own = source.resolve().parent == SHIPPED.resolve().parent
         return None if own or config.quick else certificate.beside(source)
     to = Path(config.to)
     if to.suffix != ".json" or to.is_dir() or not to.parent.is_dir():
-        raise frame.UserError(f"to = {to}: allowed a file NAME.json in a folder that is there")
+        raise frame.UserError(f"to = {to}: allowed a file NAME.json in an existing folder")
     return to
 
 
@@ -114,7 +114,7 @@ def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[
 
 
 def _row(loop: Any, proof: Proof) -> dict[str, Any]:
-    """Summarise a case over the strips that the pump can hold; OD: of the middle strip."""
+    """Summarise a case over the strips of setpoints that the pump can hold; the OD value is of the middle strip."""
     held = np.flatnonzero(proof.holdable)
     middle = held[np.abs((loop.low + loop.high)[held] / 2.0 - np.mean((loop.low[0], loop.high[-1]))).argmin()]
     return {

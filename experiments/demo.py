@@ -1,7 +1,7 @@
 """All steps in one command, `python -m experiments.demo`: calibrate, train, certify, deploy, report.
 
-Each step is a command as a user types it, shown before it runs. It runs in a fork of this process with loaded
-libraries, which saves most of the start time of five programs.
+The demo prints each step as a user would type it, then runs it in a fork of this process. The fork has all libraries
+loaded, which saves most of the start time of five programs.
 """
 
 import argparse
@@ -23,10 +23,10 @@ OTHERS = (
 PLAN = """\
 The demo runs five commands, in about 15 s:
   1 calibrate   fit growth rate and pump to the recording that comes with the program
-  2 train       train a DQN on the fitted model
-  3 certify     prove bounds of its closed loop
-  4 deploy      run it on an emulated Chi.Bio, by the driver of the real one, in virtual time
-  5 report      put everything on one page
+  2 train       train a DQN policy on the fitted model
+  3 certify     prove bounds of the policy's closed loop
+  4 deploy      run the policy on an emulated Chi.Bio, with the real driver, in virtual time
+  5 report      show all results on one page
 Output files: {folder}"""
 
 
@@ -34,7 +34,7 @@ def commands(folder: Path) -> list[list[str]]:
     """Return the steps: the name of each command and its overrides, each with its own folder below `folder`."""
     calibrated = folder / "1_calibrate" / "calibrated.yaml"
     policy = folder / "2_train" / "policy.npz"
-    return [  # seed 3 is within the limits after 1,800 steps; others need up to 10,000
+    return [  # seed 3 meets the limits after 1,800 steps; other seeds need up to 10,000
         ["calibrate", f"hydra.run.dir={folder / '1_calibrate'}"],
         ["train", f"env_file={calibrated}", "stop_within=1", "seed=3", f"hydra.run.dir={folder / '2_train'}"],
         ["certify", f"policy={policy}", f"hydra.run.dir={folder / '3_certify'}"],
@@ -61,9 +61,9 @@ def _run(arguments: list[str]) -> None:
 def step(arguments: list[str], signals: list[int]) -> int:
     """Run one command to its end; return its exit status, or the status of a stopped command.
 
-    It has its own session, so that each signal reaches it once, from here. Meanwhile this process loads the libraries
-    of later commands.
-    Args: signals: received here and passed on.
+    The command has its own session, so that each signal reaches it once, through this process. Meanwhile this process
+    loads the libraries of later commands.
+    Args: signals: signals that this process has received; each is removed and passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False
     with stop.blocked(*stop.SIGNALS):
@@ -80,7 +80,7 @@ def step(arguments: list[str], signals: list[int]) -> int:
 
 
 def main() -> None:
-    """Entry point; exits with the status of the first step that fails."""
+    """Run all steps; exit with the status of the first step that fails."""
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
     _, others = parser.parse_known_args()
     if others:

@@ -11,7 +11,7 @@ from experiments.control.notify import hidden
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """Run one closed loop over the scenario."""
-    from experiments.control import run  # matplotlib and SciPy, only after the check of the config
+    from experiments.control import run  # loads Matplotlib and SciPy, so only after the config is checked
 
     if config.dry_run:
         raise frame.UserError("dry_run=true: a sweep has no timetable; drop --multirun")
@@ -19,7 +19,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 class _Deploy(frame.EntryPoint[DeployConfig]):
-    """`deploy`: `dry_run=true` answers without a run folder, and no file has the hook's address."""
+    """Entry point of `deploy`: `dry_run=true` makes no run folder, and the hook's address is kept out of all files."""
 
     def _answer(self, given: list[str]) -> None:
         given = hidden(given, os.environ)

@@ -28,7 +28,7 @@ class MarkConfig:
     reactor: str = setting("", "reactor position or unit; '': all")
     text: str = setting("inoculated", "event, in one line of at most 80 characters")
     level_ml: float | None = setting(
-        None, "volume read from the vial; sets the ledger of a running deployment, and the unit's own", "mL",
+        None, "volume read from the vial; a running deployment sets its ledger and the unit's own to it", "mL",
         within=(0, 40),
     )  # fmt: skip
     share: float | None = setting(
@@ -36,11 +36,11 @@ class MarkConfig:
     )
     sd: float | None = setting(None, "sd of that share; null: 0.03", within=(0.001, 0.5))
     bottle_ml: float | None = setting(
-        None, "volume to which the bottle was filled; a running deployment counts from it", "mL", within=(1, 100_000)
+        None, "volume in the bottle after filling; a running deployment counts down from it", "mL", within=(1, 100_000)
     )
     minute: float | None = setting(
         None,
-        "minute of the run of the event or sample; null: now",
+        "minute of the run at which the event or sample took place; null: now",
         "min",
         within=(-1440.0, 1_000_000.0),
     )
@@ -53,15 +53,15 @@ class MarkConfig:
             repr(self.text),
             "1 to 80 characters, one line",
         )
-        require(self.sd is None or self.share is not None, "sd", self.sd, "null, or beside share=SHARE")
+        require(self.sd is None or self.share is not None, "sd", self.sd, "null, or together with share=SHARE")
         measured = [key for key in ("level_ml", "share", "bottle_ml") if getattr(self, key) is not None]
         if measured:
-            require(bool(self.reactor), "reactor", repr(self.reactor), f"the one that {measured[0]} is of")
+            require(bool(self.reactor), "reactor", repr(self.reactor), f"the reactor of {measured[0]}")
         if self.bottle_ml is not None:
-            require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone: mark them one after the other")
+            require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone; mark the other value separately")
             require(self.minute is None, "minute", self.minute, "null with bottle_ml, which applies now")
         if self.level_ml is not None:
-            require(self.share is None, "share", self.share, "null beside level_ml: mark them one after the other")
+            require(self.share is None, "share", self.share, "null together with level_ml; mark each separately")
             require(self.minute is None, "minute", self.minute, "null with level_ml, which applies now")
 
 
@@ -70,14 +70,14 @@ def _minute_now(folder: Path, stored: Any) -> float:
     from hardware.family import family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
-    over = frame.UserError(f"run={folder}: not running; give minute=MINUTE of the run")
+    over = frame.UserError(f"run={folder}: the run is over; give the time of the event by minute=MINUTE")
     if kind in known() and family(kind).simulated:
         raise over
     rows, _ = read_journal(folder / "journal.jsonl")
     if [row["kind"] for row in rows if row["kind"] in ("start", "stop")][-1:] == ["stop"]:
         raise over
     if not rows:
-        raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
+        raise frame.UserError(f"run={folder}: the run has not begun; wait for its first sample")
     speed = OmegaConf.select(stored, "backend.speed")  # an emulated device can be faster
     return run_time(rows, 1.0 if speed is None else float(speed)).s / 60.0
 
@@ -96,7 +96,7 @@ def mark(config: MarkConfig) -> str:
     folder = Path(config.run)
     known = sorted(path.stem for path in (folder / "recordings").glob("*.csv")) if config.run else []
     if not known:
-        raise frame.UserError(f"run={config.run}: no deployment (it has no recordings); give the folder of one")
+        raise frame.UserError(f"run={config.run}: not a deployment folder (no recordings/); give a folder of deploy")
     if config.reactor and config.reactor not in known:
         raise frame.UserError(f"reactor={config.reactor}: not in this run; allowed {', '.join(known)}")
     try:
@@ -105,7 +105,7 @@ def mark(config: MarkConfig) -> str:
         if minute is None:
             minute = _minute_now(folder, stored)
         elif config.share is not None and minute > (now := _latest(folder, stored)):
-            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; that sample is in the future")
+            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, the present minute of the run")
         said = [f"level {config.level_ml:g} mL"] if config.level_ml is not None else []
         sd = None if config.share is None else USUAL_SD if config.sd is None else config.sd
         said += [f"bottle {config.bottle_ml:g} mL"] if config.bottle_ml is not None else []
@@ -115,7 +115,7 @@ def mark(config: MarkConfig) -> str:
         path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd, config.bottle_ml))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
-    taken = "; a running deployment uses it with its next sample" if said else ""
+    taken = "; a running deployment uses this value at its next sample" if said else ""
     return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 
@@ -128,7 +128,7 @@ def _quoted(argument: str) -> str:
 
 
 class _Mark(frame.EntryPoint[MarkConfig]):
-    """A command that uses another run's folder and has none of its own."""
+    """Entry point of `mark`, which writes into the folder of another run and makes none itself."""
 
     def _answer(self, given: list[str]) -> None:
         if any(a.startswith("-") for a in given):

@@ -1,4 +1,4 @@
-"""Go through a recording as a run would, without acting: `python -m experiments.replay data=FILE`."""
+"""Replay a recording as if it were a run, without acting on it: `python -m experiments.replay data=FILE`."""
 
 import logging
 from collections import Counter
@@ -36,23 +36,23 @@ from hardware.watched import WatchedInterlock
 
 log = logging.getLogger(__name__)
 
-SLOWEST_MIN = 0.5  # readings that come faster are merged to minutes
-DAY_MIN, RISE_MIN = 1440.0, 120.0  # of the loop on the twin: its length, and the time after which its error counts
+SLOWEST_MIN = 0.5  # period of readings; faster ones are merged to one a minute
+DAY_MIN, RISE_MIN = 1440.0, 120.0  # longest closed loop on the twin; its error counts after the rise
 
 
 @dataclass(frozen=True)
 class ReplayConfig(Source):
-    """A recording, and the controller, the estimator and the interlock that go through it."""
+    """Config of a replay: the recording, and the controller, estimator and interlock that process its readings."""
 
-    controller: Any = part(LearnedConfig, "what decides the pump rate", registry.config_at)
-    policy: str = setting("shipped", "of controller=dqn: `shipped`, a policy.npz, a run folder, or `latest`")
+    controller: Any = part(LearnedConfig, "controller of the pump rate", registry.config_at)
+    policy: str = setting("shipped", "for controller=dqn: `shipped`, a policy.npz, a run folder, or `latest`")
     setpoint: float | None = setting(
-        None, "OD that is asked for; null: the median at which the device dosed", "OD", within=(0.02, 1.5)
+        None, "setpoint of the controller; null: the median OD at which the device dosed", "OD", within=(0.02, 1.5)
     )
-    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose growth model the controller is given")
-    bench: Bench = part(Bench, "volume of the vial and largest feed rate; the period is that of the readings")
+    env_file: str | None = setting(None, "growth model of the controller: a calibrated.yaml, or `latest`")
+    bench: Bench = part(Bench, "volume of the vial and largest feed rate; the readings give the period")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
-    identify: IdentifyConfig = part(IdentifyConfig, "how the recording's twin is found, on which the loop is closed")
+    identify: IdentifyConfig = part(IdentifyConfig, "fit of the recording's twin, a simulated vial for a closed loop")
 
 
 def body(config: ReplayConfig, folder: Path) -> None:
@@ -75,16 +75,14 @@ def body(config: ReplayConfig, folder: Path) -> None:
     interlock = WatchedInterlock(1, config.safety, bench)
     found = replay(series, temperature, make(), interlock, setpoint, model)
     name = Path(source).name
-    charts.save(
-        figure.replay_figure(found, f"{name}: what a run would have estimated and done"), folder / "figures", "replay"
-    )
+    charts.save(figure.replay_figure(found, f"{name}: estimates and doses of a run"), folder / "figures", "replay")
     try:
         minutes, od, rate = _on_twin(config, merged(raw), bench, make(), setpoint, model)
         error = float(np.abs(od - setpoint)[minutes >= min(RISE_MIN, 0.5 * minutes[-1])].mean())
         closed: dict[str, Any] = {"mean_abs_error": error, "hours": float(minutes[-1] / 60.0)}
         title = f"the same controller in closed loop on the recording's twin: mean error {error:.4f} OD"
         charts.save(figure.twin_figure(minutes, od, rate, setpoint, title), folder / "figures", "twin")
-    except ValueError as unknown:  # the recording tells no tau
+    except ValueError as unknown:  # the recording does not determine tau
         closed = {"none": str(unknown)}
     files.write_json(folder / "summary.json", _summary(found, recording.notes, closed) | {"data": source})
     shown = page.of_runs(folder, [folder])
@@ -97,9 +95,9 @@ def body(config: ReplayConfig, folder: Path) -> None:
 def _on_twin(
     config: ReplayConfig, raw: Series, bench: Bench, law: Controller, setpoint: float, model: EnvConfig
 ) -> tuple[Array, Array, Array]:
-    """Close the loop on the recording's twin; minutes, true OD and pump rate, (K,) each.
+    """Simulate the closed loop on the recording's twin; return minutes, true OD and pump rate, (K,) each.
 
-    Raises: ValueError where the recording tells no tau, or no plant can do what it shows.
+    Raises: ValueError if the recording does not determine tau, or no plant can show this recording.
     """
     plant = plant_of(twin(raw, calibrate(raw, config.identify), config.identify.segment_min))
     vials = SimulatedReactors(Plant(plant, 1, np.random.default_rng(0)), SimulatedConfig(), bench.control_min)
@@ -111,7 +109,7 @@ def _on_twin(
 
 
 def _usual(series: Series) -> float:
-    """Return the median OD at which the device dosed, or of all readings; within what a setpoint may be."""
+    """Return the median OD at which the device dosed, else of all readings, clipped to the allowed setpoints."""
     dosed = series.od[(series.pump_rate > 0.0) & np.isfinite(series.od)]
     return float(np.clip(np.median(dosed) if len(dosed) else np.nanmedian(series.od), 0.02, 1.5))
 
@@ -128,7 +126,7 @@ def _law(config: ReplayConfig, model: EnvConfig) -> Callable[[], Controller]:
 
 
 def _summary(found: Replayed, notes: tuple[str, ...], closed: dict[str, Any]) -> dict[str, Any]:
-    """Build summary.json. Its ranges are of nine readings in ten."""
+    """Build summary.json. The ranges of mu and gain reach from the 5 % to the 95 % quantile of the readings."""
     told = Counter(kind for reason in found.reasons for kind in kinds_of(reason))
     spread = {
         name: [float(v) for v in np.nanquantile(values, [0.05, 0.95])] if np.isfinite(values).any() else None

@@ -32,15 +32,15 @@ def _summary(run: Path) -> Any:
         summary = json.loads((run / "summary.json").read_text("utf-8"))
         json.dumps(summary, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise frame.UserError(f"run={run}: its summary.json is damaged ({error}); run it again") from None
+        raise frame.UserError(f"run={run}: summary.json is damaged ({error}); repeat the run") from None
     return summary
 
 
 def write(folder: Path) -> Path:
     """Write report.html and tables/ into a folder; return the page's path.
 
-    A benchmark has its own kind of page; another run its summary and figures; a folder of runs (e.g. of `make run`) a
-    section for each. Raises: frame.UserError without a run.
+    A benchmark has its own kind of page. The page of any other run shows its summary and figures. A folder of runs
+    (e.g. of `make run`) gets a section for each run. Raises: frame.UserError without a run.
     """
     from experiments.comparison import page as comparison
     from experiments.record import aftermath
@@ -48,9 +48,9 @@ def write(folder: Path) -> Path:
 
     runs = [folder] if (folder / "summary.json").is_file() else sorted(p.parent for p in folder.glob("*/summary.json"))
     if not runs:
-        raise frame.UserError(f"run={folder}: holds no summary.json; give the folder of a finished run")
+        raise frame.UserError(f"run={folder}: no summary.json in this folder; give the folder of a finished run")
     summaries = [_summary(run) for run in runs]
-    runs.sort(key=lambda run: not (run / "recordings").is_dir())  # what the others were for comes first
+    runs.sort(key=lambda run: not (run / "recordings").is_dir())  # the deployment comes first
     compared = runs == [folder] and isinstance(summaries[0], dict) and "beside_paper" in summaries[0]
     try:
         return page.save(
@@ -62,7 +62,7 @@ def write(folder: Path) -> Path:
         if not compared:
             raise
         why = f"{type(error).__name__}: {error}"
-        raise frame.UserError(f"run={folder}: not the summary.json of a benchmark ({why}); run it again") from None
+        raise frame.UserError(f"run={folder}: not the summary.json of a benchmark ({why}); repeat the run") from None
 
 
 def compare(folder: Path) -> Path:
@@ -79,10 +79,10 @@ def compare(folder: Path) -> Path:
         own = [a for a in swept.arguments if not a.startswith("hydra/")] if swept else []
         expected = sweep.jobs(words.normalise(own, swept.command)) if swept else None
     except frame.UserError:
-        expected = None  # listed files are gone: use the jobs with a folder
+        expected = None  # a file of the command line is missing: use the jobs that have a folder
     jobs = [_result(job) for job in sweep.survey(folder, expected)]
     if not jobs:
-        raise frame.UserError(f"runs={folder}: holds no job of a sweep; give the folder that train -m has written")
+        raise frame.UserError(f"runs={folder}: no job of a sweep in this folder; give a folder written by train -m")
     command = swept.command if swept else folder.resolve().parent.name
     return page.save(
         sweep_page.of_sweep(folder, command, jobs, swept.again() if swept else "start the sweep anew"), folder
@@ -90,9 +90,9 @@ def compare(folder: Path) -> Path:
 
 
 def _result(job: sweep.Job) -> Result:
-    """Build a job's result for the page. Overrides are those of the command line, key by key."""
+    """Build a job's result for the page, with the values that the job's command line sets."""
     overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
-    if preset := overrides.pop("hparams_search", None):  # a single run of the same values is no search
+    if preset := overrides.pop("hparams_search", None):  # list the preset's values: a single run is not a search
         path = presets.ROOT / "hparams_search" / f"{preset}.yaml"
         own: Any = files.load_yaml(path) if path.is_file() else {}
         fixed = {str(k): str(v) for k, v in own.items() if k not in ("defaults", "hydra")}
@@ -106,7 +106,7 @@ def _result(job: sweep.Job) -> Result:
 
 
 def find(name: str, root: Path = Path("runs")) -> Path:
-    """Find a run folder by its path or `latest`. Raises: frame.UserError with the remedy."""
+    """Find a run folder by its path or by `latest`. Raises: frame.UserError with the remedy."""
     if name != "latest":
         if not Path(name).is_dir():
             raise frame.UserError(f"run={name}: no such folder; give the folder of a finished run")
@@ -118,7 +118,7 @@ def find(name: str, root: Path = Path("runs")) -> Path:
 
 
 def report(config: ReportConfig, folder: Path) -> None:
-    """Write the report of a run; `folder` is only for the log."""
+    """Write the report of a run or sweep into its folder; `folder` gets only the log."""
     if config.runs is not None:
         log.info("report %s", compare(Path(config.runs)))
     else:

@@ -31,10 +31,10 @@ log = logging.getLogger(__name__)
 class ScoreConfig:
     """Config of a score: policy and task. Raises: ValueError with key, value and allowed range."""
 
-    policy: str = setting("", "a policy.npz, a run folder, `latest`, or module:function of a Python file here")
+    policy: str = setting("", "a policy.npz, a run folder, `latest`, or module:function of a file in this folder")
     env: Any = part(EnvConfig, "the task", env_schema)
-    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
-    onnx: str | None = setting(None, "FILE.onnx to which the network of a policy.npz is written as well")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: the newest of calibrate; replaces env")
+    onnx: str | None = setting(None, "FILE.onnx: also write the network of a policy.npz there")
 
     def __post_init__(self) -> None:
         check(self)
@@ -42,9 +42,9 @@ class ScoreConfig:
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A function from observations, float32 (N, O), to action indices (N,), used like a `dqn.policy.Policy`.
+    """A function that can be scored like a `dqn.policy.Policy`.
 
-    actions: the grid, (A,).
+    call: maps observations, float32 (N, O), to action indices, (N,). actions: value of each action, (A,).
     """
 
     call: Callable[[NDArray[np.float32]], Any]
@@ -54,7 +54,7 @@ class Function:
         return checked_actions(self.call(observation.astype(np.float32)), observation.shape[:1], self.actions.size)
 
     def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the value of each action."""
+        """Return the value of the chosen action for each observation, (N,)."""
         return self.actions[self.act(observation)]
 
 
@@ -76,12 +76,12 @@ def _found(name: str, task: tasks.Task) -> Any:
     if policy.observation != task.observation or policy.actions.size != task.actions.size:
         seen = f"{policy.actions.size} actions from {', '.join(policy.observation)}"
         asked = f"{task.actions.size} from {', '.join(task.observation)}"
-        raise frame.UserError(f"policy={name}: {seen}; this task has {asked}: choose another env=")
+        raise frame.UserError(f"policy={name}: {seen}, but this task has {asked}; choose the env= of the policy")
     return policy
 
 
 def score(config: ScoreConfig, folder: Path) -> float:
-    """Score and report; return the regret, per cent. Raises: frame.UserError without a policy."""
+    """Score the policy and write a report; return the regret, per cent. Raises: frame.UserError without a policy."""
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
 
@@ -110,8 +110,8 @@ def score(config: ScoreConfig, folder: Path) -> float:
         for name, figure in drawn.items():
             events.picture(f"figures/{name}", charts.save(figure, folder / "figures", name), 0)
     log.info("%s, %s", config.policy, task.description)
-    log.info("regret %.4g %% (the one-line controller: %.4g %%)", summary["regret_pct"], summary["myopic_regret_pct"])
-    log.info("error at rest %.4g %s (the optimum: %.4g)", found.steady_abs_error[0], task.unit, grid.optimum_steady)
+    log.info("regret %.4g %% (one-line controller: %.4g %%)", summary["regret_pct"], summary["myopic_regret_pct"])
+    log.info("steady error %.4g %s (optimum: %.4g)", found.steady_abs_error[0], task.unit, grid.optimum_steady)
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
     return float(found.regret_pct[0])
 

@@ -1,4 +1,4 @@
-"""Learn a pump policy on the calibrated growth model: `python -m experiments.train`."""
+"""Train a pump policy on the calibrated growth model: `python -m experiments.train`."""
 
 from pathlib import Path
 
@@ -7,8 +7,8 @@ from experiments.training.config import TrainConfig
 
 
 def train(config: TrainConfig, folder: Path) -> float:
-    """Train, export and report; return the objective of a sweep, the merit of the worst seed."""
-    from experiments.training import run  # torch, only after the check of the config
+    """Train, export and report; return the merit of the worst seed, which is the objective of a sweep."""
+    from experiments.training import run  # loads torch, so only after the config is checked
 
     return run.train(config, folder)
 

@@ -454,7 +454,7 @@ def test_a_command_that_no_heading_lists_stands_below_others(monkeypatch):
     assert program.names()[-1] == "audit"
     assert page[page.index("Others") + 1].split() == ["audit", "What", "audit", "does."]
     assert page.count("  blank           What blank does.") == 1
-    assert page.index("At the device") < page.index("  mark            What mark does.") < page.index("Side by side")
+    assert page.index("At the device") < page.index("  mark            What mark does.") < page.index("Comparisons")
 
 
 def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_path, monkeypatch):

@@ -149,7 +149,7 @@ def test_two_pumps_of_two_units_are_stored_apart_with_what_was_weighed(tmp_path:
 def test_an_answer_that_is_no_mass_is_asked_for_again(capsys: pytest.CaptureFixture[str]) -> None:
     answers = iter(["", "-0.1", "10000", "nan", "12,5 g", " 12,75 "])
     assert _number(lambda question: next(answers), "grams: ") == 12.75
-    assert capsys.readouterr().out.count("is no mass in grams; a number from 0 to 10000, please") == 5
+    assert capsys.readouterr().out.count("is not a mass in grams; type a number from 0 to 10000") == 5
     assert _number(lambda question: "0", "grams: ") == 0.0
 
 

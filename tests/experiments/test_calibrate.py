@@ -371,7 +371,7 @@ def test_a_generated_recording_is_as_long_as_asked_and_says_what_it_is_of(tmp_pa
     rows = (tmp_path / "threshold.csv").read_text().splitlines()
     assert (len(rows), rows[0], rows[-1].split(",")[0]) == (62, "time_min,od,pump_rate_ml_s", "120.0")
     assert f"61 rows (threshold; mu 0.021, tau 0.41) in {tmp_path}/threshold.csv" in capsys.readouterr().out
-    with pytest.raises(frame.UserError, match=r"threshold\.csv: exists; remove it or choose another file"):
+    with pytest.raises(frame.UserError, match=r"threshold\.csv: this file exists; remove it or choose another file"):
         command.body(config, tmp_path)
 
 

@@ -127,12 +127,12 @@ def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], 
 def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorded(tmp_path / "a.csv", 0.0, {27.5: 4.0, 29.0: 2.5, 31.0: 3.6, 34.5: 3.6})
     for config, said in (
-        (CalibratePairConfig(), r"first=\[\]: allowed one or more recordings"),
+        (CalibratePairConfig(), r"first=\[\]: give one or more recordings"),
         (CalibratePairConfig((f"{tmp_path}/a.csv",), ("none.csv",)), r"none\.csv"),
     ):
         with pytest.raises(frame.UserError, match=said):
             calibrate_pair(config, tmp_path)
-    assert "a.csv: left out: 29.0 degC from minute" in caplog.text
+    assert "a.csv: ignored: 29.0 degC from minute" in caplog.text
     assert "it takes 180" in caplog.text
 
 
@@ -216,15 +216,15 @@ def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_
     assert caplog.text == ""
     exact = _growth("beta", [*few, at(35.0, 0.9)], 2.0, CalibratePairConfig(degree=4))
     assert len(exact.coefficients) == 3
-    assert "beta: a curve through all of its 3 points: its error is unknown; record more" in caplog.text
+    assert "beta: the curve meets all 3 points: its error is unknown; record more temperatures" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("cells", "said"),
     [
-        (["", ""], "no temperature in it; give a recording with a column temperature_degc"),
-        (["303", "300"], "temperatures of 300 to 303: allowed 4 to 60 degC; are they in degC"),
-        (["3.9", "31"], "temperatures of 3.9 to 31: allowed"), (["60.5", "31"], "temperatures of 31 to 60.5: allowed"),
+        (["", ""], "no temperatures; give a recording with a column temperature_degc"),
+        (["303", "300"], "temperatures from 300 to 303: allowed 4 to 60 degC; "),
+        (["3.9", "31"], "temperatures from 3.9 to 31"), (["60.5", "31"], "temperatures from 31 to 60.5"),
     ],
 )  # fmt: skip
 def test_a_recording_whose_temperatures_cannot_be_is_named(cells: list[str], said: str, tmp_path: Path) -> None:
@@ -242,14 +242,12 @@ def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(tmp_
     told = {"first": 0.021, "first_sd": 0.004, "second": -0.104, "second_sd": 0.012, "even_c_alone": 32.126}
     _say(CalibratePairConfig(names=("alpha", "beta")), TRUE, points, found, told, tmp_path)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "alpha: 1/h at degC, and its distance from the curve in sds"
+    assert lines[0] == "alpha: temperature in degC, growth rate in 1/h (95 % interval), distance from the curve in sds"
     assert lines[1:3] == ["   27.00  0.5200 (0.5100 to 0.5300)  +0.2", "   35.00  1.0000 (0.9800 to 1.0200)  -1.5"]
     assert lines[4] == "   28.00  0.8600 (0.8300 to 0.8900)  +2.0   light per OD 4100"
-    assert lines[5] == (
-        "mixed: curves off by +0.021 +- 0.004 and -0.104 +- 0.012, corrected; they crossed at 32.13 degC"
-    )
+    assert lines[5] == "mixed: curves corrected by +0.021 +- 0.004 and -0.104 +- 0.012; before, they met at 32.13 degC"
     crossing = (0.54 + np.sqrt(0.54**2 - 4 * 0.01 * 7.0)) / 0.02  # of the two curves, within 27 to 35 degC
-    gains = "beta gains +0.290 1/h at 27 degC and -0.350 at 35"
+    gains = "growth of beta minus alpha: +0.290 1/h at 27 degC and -0.350 1/h at 35 degC"
     assert lines[6] == f"both grow alike at {crossing:.2f} degC; {gains}"
     assert lines[7] == f"files {tmp_path}/pair.yaml, {tmp_path}/figures/pair.png"
 
@@ -286,13 +284,13 @@ def test_a_pair_holds_where_both_were_recorded_and_says_by_what(tmp_path, monkey
     assert told["mixed"] is None
     assert "mixed" not in capsys.readouterr().out
     first[:] = [at(t, float(linear(t))) for t in (24.0, 26.0, 28.1)]
-    with pytest.raises(frame.UserError, match=r"^recorded: alpha at 24\.0 to 28\.1 degC and beta at 28\.5 to 35\.0 "):
+    with pytest.raises(frame.UserError, match=r"^alpha at 24\.0 to 28\.1 degC and beta at 28\.5 to 35\.0 "):
         calibrate_pair(config, tmp_path)
     for wrong, said in (
-        ({"names": ("x", "x")}, "names = .*: allowed two that differ"),
-        ({"names": ("x",)}, "names = .*: allowed two, of the first and of the second species"),
-        ({"lags_min": (60.0, 2.0)}, "lags_min = .*: allowed two of 0 to 600 min, the first not longer"),
-        ({"lags_min": (0.0, 601.0)}, "lags_min = .*: allowed two of 0 to 600 min"),
+        ({"names": ("x", "x")}, "names = .*: allowed two different names"),
+        ({"names": ("x",)}, "names = .*: allowed two values, one for each species"),
+        ({"lags_min": (60.0, 2.0)}, "lags_min = .*: allowed 0 to 600 min, the smaller one first"),
+        ({"lags_min": (0.0, 601.0)}, "lags_min = .*: allowed 0 to 600 min"),
     ):
         with pytest.raises(ValueError, match=said):
             CalibratePairConfig(**wrong)

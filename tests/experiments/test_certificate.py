@@ -514,7 +514,7 @@ def test_a_certificate_goes_beside_its_policy_or_where_it_is_sent_and_never_into
         assert command._place(config, of) == where
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for bad in ("mine.npz", ".", "nowhere/certificate.json"):
-        with pytest.raises(UserError, match=r"to = .*: allowed a file NAME\.json in a folder that is there"):
+        with pytest.raises(UserError, match=r"to = .*: allowed a file NAME\.json in an existing folder"):
             command.body(CertifyConfig(policy=str(source), to=str(tmp_path / bad)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 

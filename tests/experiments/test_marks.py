@@ -245,15 +245,15 @@ def test_what_was_counted_stands_before_the_note_which_is_cut_to_a_line(tmp_path
     first, second, third = read_marks(folder)
     assert first == Mark(3.0, "M0", "share 0.4 +- 0.012, " + "x" * 60, None, 0.4, 0.012)
     assert (second.text, second.level_ml, third.text, third.level_ml) == ("level 0 mL", 0.0, "level 40 mL, foam", 40.0)
-    with pytest.raises(ValueError, match=r"share = 0\.4: allowed null beside level_ml: mark them one after the other"):
+    with pytest.raises(ValueError, match=r"share = 0\.4: allowed null together with level_ml; mark each separately"):
         MarkConfig(str(folder), "M0", share=0.4, level_ml=20.0)
     for key, value in {"share": 0.4, "level_ml": 18.5, "bottle_ml": 500.0}.items():
-        with pytest.raises(ValueError, match=f"reactor = '': allowed the one that {key} is of"):
+        with pytest.raises(ValueError, match=f"reactor = '': allowed the reactor of {key}"):
             MarkConfig(str(folder), **{key: value})
     with pytest.raises(ValueError, match="minute = 3.0"):  # a level is of now
         MarkConfig(str(folder), "M0", level_ml=18.5, minute=3.0)
     (folder / "journal.jsonl").write_text("")
-    with pytest.raises(frame.UserError, match=r"run=.*run: has not begun; wait for its first sample"):
+    with pytest.raises(frame.UserError, match=r"run=.*run: the run has not begun; wait for its first sample"):
         mark(MarkConfig(str(folder), "M0"))
 
 
@@ -265,7 +265,7 @@ def test_a_sample_may_be_of_any_minute_up_to_the_newest_row_of_any_reactor(tmp_p
     (over / "recordings" / "M2.csv").write_text("time_min,od\n")
     said = mark(MarkConfig(str(over), "M0", share=0.4, minute=93.5))
     assert said.startswith("M0: share 0.4 +- 0.03 at minute 93.5, in ")
-    assert said.endswith("marks.csv; a running deployment uses it with its next sample")
+    assert said.endswith("marks.csv; a running deployment uses this value at its next sample")
     said = mark(MarkConfig(str(over), text="new bottle", minute=-30.0))
     assert said == f"all reactors: new bottle at minute -30.0, in {over}/marks.csv"
     with pytest.raises(frame.UserError, match=r"reactor=M3: not in this run; allowed M0, M1, M2$"):
@@ -315,11 +315,11 @@ def test_a_note_is_taken_as_it_was_typed(text, tmp_path, monkeypatch, capsys):
 
 def test_a_share_is_of_a_sample_that_somebody_has_drawn(tmp_path: Path) -> None:
     folder = _under_way(tmp_path / "run")
-    with pytest.raises(frame.UserError, match=r"minute=40: allowed up to (19|20|21|22), now; "):
+    with pytest.raises(frame.UserError, match=r"minute=40: allowed up to (19|20|21|22), "):
         mark(MarkConfig(str(folder), "M0", share=0.4, minute=40.0))
     mark(MarkConfig(str(folder), "M0", "plate 7", share=0.4, minute=12.0))
     assert read_marks(folder) == [Mark(12.0, "M0", "share 0.4 +- 0.03, plate 7", None, 0.4, 0.03)]
-    with pytest.raises(ValueError, match="sd = 0.05: allowed null, or beside share"):
+    with pytest.raises(ValueError, match="sd = 0.05: allowed null, or together with share"):
         MarkConfig(str(folder), "M0", sd=0.05)
 
 
@@ -357,10 +357,10 @@ def test_whoever_marks_waits_for_another_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"run": "nowhere"}, "run=nowhere: no deployment"), ({}, "run=: no deployment"),
+        ({"run": "nowhere"}, "run=nowhere: not a deployment"), ({}, "run=: not a deployment"),
         ({"run": "run", "reactor": "M7"}, "reactor=M7: not in this run; allowed M0"),
-        ({"run": "over"}, "run=over: not running; give minute="),
-        ({"run": "simulated"}, "run=simulated: not running; give minute="),
+        ({"run": "over"}, "run=over: the run is over; give "),
+        ({"run": "simulated"}, "run=simulated: the run is over; give "),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(config, message, tmp_path, monkeypatch):

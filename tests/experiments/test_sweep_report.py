@@ -291,5 +291,5 @@ def test_what_differs_names_a_configuration_and_what_all_share_is_said_once() ->
 
 
 def test_a_folder_without_a_sweep_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(frame.UserError, match=r"holds no job of a sweep; give the folder that train -m has written"):
+    with pytest.raises(frame.UserError, match=r"no job of a sweep in this folder; give a folder written by train -m"):
         report.compare(tmp_path)
