@@ -192,7 +192,8 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     assert check.ok
     assert all(str(one) in check.detail for one in worst(found))
     weak, grown = Bench(volume_ml=28.0), replace(ASKED, env=EnvConfig(mu=0.0432))
-    written(source, laws.law(), config=grown)
+    given = replace(laws.law(), metadata={**laws.law().metadata, "model": {**laws.MODEL, "mu": 0.0432}})
+    written(source, given, config=grown)
     said = refused(source, tmp_path / "run", bench=weak)
     assert "certified again" in said
     assert "the pump cannot hold: 2" in said
