@@ -22,7 +22,7 @@ class Fixed:
 
     lowest_od: float = 0.005  # below it the logarithm of a reading is meaningless
     gain_range: tuple[float, float] = (0.2, 3.0)  # of the relative pump gain; a head outside is broken
-    noise_range: tuple[float, float] = (0.1, 25.0)  # of the learned variance over the assumed one
+    noise_range: tuple[float, float] = (0.1, 100.0)  # of the learned variance over the assumed one
     trend_weight: float = 0.4  # weight of the newest innovation in the running mean
     calm: float = 1.5  # a mean within this many sd is no sign of a change
     farthest: float = 3.0  # limit of an innovation in sd
