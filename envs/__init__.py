@@ -1,4 +1,4 @@
-"""The simulated world: growth, dilution, sensors, plants and environments; NumPy only, batch axis first.
+"""Simulation of growth, dilution, sensors, plants and environments, in NumPy, with the batch axis first.
 
 Importing this package registers its environments (`gym_adapter.REGISTERED`) with Gymnasium.
 """

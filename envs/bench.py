@@ -1,4 +1,4 @@
-"""Bench values that all parts of the program share: culture volume, control period, largest pump rate."""
+"""Bench values, which all parts of the program share: culture volume, control period, largest pump rate."""
 
 import math
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ WITHIN_ML = (5.0, 38.0)
 class Bench:
     """Bench values for interlock, driver, estimators, controllers, certificate, timetable and simulated vials.
 
-    A pump rate in mL/s is a mean over a control period; the driver chooses the actual flow.
+    A pump rate in mL/s is the mean over a control period. The driver chooses the actual flow of the pump.
 
     Raises: ValueError with key, value and allowed range.
     """
 
     volume_ml: float = setting(20.0, "culture volume up to the waste tube", "mL", within=WITHIN_ML)
     volumes_ml: dict[str, float] = setting(
-        {}, "volume of single reactors that differ, e.g. bench.volumes_ml.M1=14", "mL"
+        {}, "volume of reactors that differ from volume_ml, e.g. bench.volumes_ml.M1=14", "mL"
     )
     period_s: float = setting(60.0, "control period: from one sample and its dose to the next", "s", within=(1, 3600))
     max_rate: float = setting(
-        0.02, "largest pump rate; the Chi.Bio's own regulator has this limit", "mL/s", above=0.0, at_most=0.05
+        0.02, "largest pump rate; the Chi.Bio's regulator has this limit", "mL/s", above=0.0, at_most=0.05
     )
     bottle_ml: float = setting(2000.0, "fresh medium per reactor at the start", "mL", above=0.0, below=math.inf)
 
@@ -42,23 +42,23 @@ class Bench:
 
     @property
     def control_min(self) -> float:
-        """The control period, min."""
+        """Control period, min."""
         return self.period_s / 60.0
 
     @property
     def stale_s(self) -> float:
-        """Age at which the newest sample is too old for a dose, s: a period and 40 s, or a tenth more."""
+        """Age at which the newest sample is too old for a dose, s: the larger of period + 40 s and 1.1 periods."""
         return max(self.period_s + 40.0, 1.1 * self.period_s)
 
     @property
     def tau(self) -> float:
-        """V/60: u/tau is the dilution rate in 1/min of a calibrated pump rate u in mL/s."""
+        """V/60 for the volume V in mL; then u/tau is the dilution rate in 1/min at the pump rate u in mL/s."""
         return self.volume_ml / 60.0
 
     def volume_of(self, reactor: str) -> float:
-        """Culture of one reactor, mL."""
+        """Return the culture volume of one reactor, mL."""
         return self.volumes_ml.get(reactor, self.volume_ml)
 
     def volumes(self, reactors: Sequence[str]) -> NDArray[np.float64]:
-        """Culture of each reactor, mL, (N,)."""
+        """Return the culture volume of each reactor, mL, (N,)."""
         return np.array([self.volume_of(name) for name in reactors])

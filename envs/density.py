@@ -1,4 +1,4 @@
-"""The paper's task as one environment, with its exact optimum beside it."""
+"""The paper's task as a single Gymnasium environment, which can also report the exact optimum."""
 
 from functools import cache, partial
 from typing import Any
@@ -9,9 +9,9 @@ from envs.vector_env import BioreactorVectorEnv
 
 
 class BioreactorEnv(EpisodeEnv):
-    """`BioreactorVectorEnv` as one environment. Version history: v0, the task of the paper.
+    """`BioreactorVectorEnv` as a single environment. Version history: v0, the task of the paper.
 
-    Args: optimum: `info` also has the exact optimum's "optimal_action" and its "optimal_rate", mL/s.
+    Args: optimum: whether `info` also contains the optimal "optimal_action" (index) and "optimal_rate" (mL/s).
     """
 
     batch = BioreactorVectorEnv

@@ -1,4 +1,4 @@
-"""The single-environment view of the vector environment, for libraries that expect `gymnasium.Env`."""
+"""Single environment made from a vector environment, for libraries that expect `gymnasium.Env`."""
 
 from typing import Any
 
@@ -13,14 +13,14 @@ REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
     "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
 }
-"""Name -> single view, vector environment, values of the task that differ from its defaults; a guest adds its own."""
+"""Name -> class of the single and of the vector environment, changes to the task's defaults. Guests add entries."""
 
 
 class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
-    """A vector environment with N = 1 and without autoreset; that class specifies observation, action and reward.
+    """Single environment: N = 1, no autoreset. The vector environment `batch` defines observation, action and reward.
 
-    Args: config: the task; overrides: values of it. render_mode: None; there is no drawing.
-    `info` holds the observation's numbers by name in full precision, as far as the model knows them: {"od": ...}.
+    `info` contains the state by the observation's names, in full precision: {"od": ...}.
+    Args: config: the task; overrides: values to change in it. render_mode: only None, as nothing is drawn.
     Raises: ValueError with the invalid value; TypeError for a `render_mode`.
     """
 
@@ -38,9 +38,9 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; a seed makes it reproducible. Args: options: as of the vector environment.
+        """Start an episode; a seed makes it reproducible. Args: options: as for the vector environment.
 
-        Raises: ValueError with an unknown option, or a value out of range.
+        Raises: ValueError for an unknown option or a value out of range.
         """
         super().reset(seed=seed)
         if seed is not None or self._next is None or options:
@@ -52,9 +52,9 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         return dict(zip(self._batch.names, self._batch.state[0].tolist(), strict=False))
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Advance one control period; `truncated` after `episode_steps`, then `reset` must follow.
+        """Advance by one control period. After `episode_steps` steps `truncated` is true; then call `reset`.
 
-        Raises: ValueError for an action that is not a single index of the grid; RuntimeError before a reset.
+        Raises: ValueError if the action is not a single index of the grid; RuntimeError before the first reset.
         """
         index = self._batch.checked(action, ())
         observation, reward, _, truncated, infos = self._batch.step(index.reshape(self._batch.action_space.shape))
@@ -66,7 +66,7 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
 
 
 def register() -> None:
-    """Make `gymnasium.make("Bioreactor-v0")` and `gymnasium.make_vec(...)` work; called on import of `envs`."""
+    """Register all environments for `gymnasium.make("Bioreactor-v0")` and `make_vec`; called on import of `envs`."""
     for name, (single, vector, values) in REGISTERED.items():
         if name not in gymnasium.registry:
             gymnasium.register(id=name, entry_point=single, vector_entry_point=vector, kwargs=dict(values))

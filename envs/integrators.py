@@ -1,4 +1,4 @@
-"""Fixed-step integrators of y' = f(y), all with one signature, for any leading batch shape."""
+"""Fixed-step integrators of y' = f(y), all with the same signature, for any leading batch shape."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ def euler(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
 
     Args:
       f: derivative, maps y to y' of the same shape. y: start value, any shape.
-      duration: time to advance, same unit of time as f.
+      duration: time to advance, in the time unit of f.
       substeps: number of equal steps, >= 1; h = duration / substeps.
     Returns: y at the end, a new array. Raises: nothing.
     """
@@ -26,7 +26,7 @@ def euler(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
 
 
 def rk4(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
-    """Integrate by classical Runge-Kutta, fourth order; arguments as `euler`."""
+    """Integrate by classical Runge-Kutta, fourth order. Args: as in `euler`."""
     h = duration / substeps
     for _ in range(substeps):
         k1 = f(y)

@@ -1,11 +1,11 @@
 """Optimal controllers of the training model by dynamic programming, the reference for every learned policy.
 
-On a fine grid of log x an action is a shift by log f_a, and V is linear between grid points. Two problems are solved:
+On a fine grid of log x, action a is a shift by log f_a, and V is linear between grid points. The two problems:
 
-- `solve_episode`: the scored problem, V_k(x) = min_a [(f_a x - s)^2 + V_{k-1}(f_a x)] with V_0 = 0, the least sum of
-squared errors over the remaining k steps. Backward induction (Bellman 1957), k sweeps over the grid.
-- `solve`: the discounted problem without an end, V(x) = min_a [(f_a x - s)^2 + gamma V(f_a x)], whose values a network
-learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
+- `solve_episode`: the scored problem, V_k(x) = min_a [(f_a x - s)^2 + V_{k-1}(f_a x)] with V_0 = 0. V_k is the least
+sum of squared errors over the remaining k steps. Backward induction (Bellman 1957) needs k sweeps over the grid.
+- `solve`: the discounted problem without an end, V(x) = min_a [(f_a x - s)^2 + gamma V(f_a x)]. Networks learn these
+values. Policy iteration (Howard 1960) solves one sparse linear system for each policy.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,16 +19,16 @@ from envs.integrators import Array
 from envs.relative import RelativeConfig
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
 
-SPACING = 4.7e-4  # of log OD: eight points per action of the nominal model
+SPACING = 4.7e-4  # grid spacing of log OD: eight points per action of the nominal model
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeOptimum:
-    """Optimal controller of targets that are known ahead, for as many steps.
+    """Optimal controller of an episode of K steps whose targets are all known in advance.
 
-    target: of each step, (K,). grid: uniform, (G,). value: V_k, the least sum of squared distances from the targets in
-    the last k steps, each taken after the step, (K + 1, G).
-    after: from states (N,) to those after each action, (N, A). place: from states to their places on the grid.
+    target: target of each step, (K,). grid: uniform grid, (G,). value: V_k, (K + 1, G): the smallest sum of squared
+    distances from the targets over the last k steps, each taken after the step.
+    after: function of states (N,) -> states after each action, (N, A). place: states -> their coordinates on the grid.
     """
 
     target: Array
@@ -38,13 +38,13 @@ class EpisodeOptimum:
     place: Callable[[Array], Array]
 
     def act(self, state: Array, left: int) -> NDArray[np.intp]:
-        """Return the best action with `left` remaining steps, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
+        """Return the best action with `left` steps remaining, 1 <= left <= K, by an exact one-step lookahead, (N,)."""
         after = self.after(state)
         ahead = np.interp(self.place(after), self.grid, self.value[left - 1])
         return np.asarray(np.argmin((after - self.target[-left]) ** 2 + ahead, axis=1), dtype=np.intp)
 
     def rollout(self, state: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Run K steps from the starts, shape (N,); return the state after each step and the action, each (K, N)."""
+        """Run K steps from the states (N,); return the state after each step and the action, each (K, N)."""
         shape, rows = (self.target.size, state.size), np.arange(state.size)
         states, actions = np.empty(shape), np.empty(shape, dtype=np.intp)
         for k in range(self.target.size):
@@ -54,10 +54,10 @@ class EpisodeOptimum:
 
 
 def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = SPACING) -> EpisodeOptimum:
-    """Solve an episode for its least undiscounted cost; states are ODs.
+    """Solve an episode for its smallest undiscounted cost; states are ODs.
 
-    Args: config: the task; with its actions and integrator. setpoint: OD, of all `config.episode_steps` steps or of
-      each of them, (K,). spacing: of log OD.
+    Args: config: the task, its actions and integrator. setpoint: OD, one for all `config.episode_steps` steps or one
+      per step, (K,). spacing: grid spacing of log OD.
     """
     factors, program = step_factors(config), np.broadcast_to(setpoint, config.episode_steps)
     log_od = _reach(config, program, factors, spacing)
@@ -71,10 +71,10 @@ def solve_episode(config: EnvConfig, setpoint: float | Array, spacing: float = S
 
 
 def _backward(stages: Sequence[Array], shift: Array) -> Array:
-    """V_k = min_a [stage_k,a + V_{k-1} moved by shift_a], V_0 = 0, shape (K + 1, G).
+    """Compute V_k = min_a [stage_k,a + V_{k-1} shifted by shift_a] with V_0 = 0, shape (K + 1, G).
 
-    Args: stages: cost of each step from each grid point, the last step first, each (A, G). shift: of each action, in
-      grid points, (A,).
+    Args: stages: cost of each step from each grid point, the last step first, each (A, G). shift: shift by each
+      action, in grid points, (A,).
     """
     points = stages[0].shape[1]
     whole = np.floor(shift)
@@ -92,7 +92,7 @@ def _backward(stages: Sequence[Array], shift: Array) -> Array:
 
 
 def solve_relative(config: RelativeConfig, growth_share: float, steps: int, spacing: float = 1 / 256) -> EpisodeOptimum:
-    """Minimise the sum of e^2 over `steps` steps at one growth share; states are errors. Args: spacing: of e."""
+    """Minimise the sum of e^2 over `steps` steps at one growth share; states are errors e on a grid of `spacing`."""
     levels = config.levels()
     reach = config.largest_error + 1.0
     error = np.linspace(-reach, reach, round(2.0 * reach / spacing) + 1)
@@ -104,7 +104,7 @@ def solve_relative(config: RelativeConfig, growth_share: float, steps: int, spac
 def _reach(config: EnvConfig, program: Array, factors: Array, spacing: float) -> Array:
     """Return a grid of log OD, shape (G,), that covers every optimal episode from the scored starts.
 
-    A culture that grows faster than the largest rate dilutes keeps growing, up to the limit of the environment.
+    If growth exceeds the dilution at the largest pump rate, the OD rises up to the limit of the environment.
     """
     low = min(config.start_od[0], SCORED_OD[0], program.min()) * 0.8
     outgrown = config.episode_steps * max(0.0, np.log(np.maximum(factors, 1e-12)).min())
@@ -117,9 +117,8 @@ def _reach(config: EnvConfig, program: Array, factors: Array, spacing: float) ->
 class OptimalPolicy:
     """Greedy policy with respect to the optimal value function of the discounted problem.
 
-    log_od: uniform grid of log OD, shape (G,). setpoints: shape (M,), sorted.
-    value: discounted cost-to-go V, shape (M, G). factors: x(t+1) = factors[a] x(t), shape (A,).
-    gamma: discount per step.
+    log_od: uniform grid of log OD, (G,). setpoints: solved setpoints, sorted, (M,). value: discounted cost-to-go V,
+    (M, G). factors: x(t+1) = factors[a] x(t), (A,). gamma: discount factor per step.
     """
 
     log_od: Array
@@ -129,7 +128,7 @@ class OptimalPolicy:
     gamma: float
 
     def cost_to_go(self, od: Array, row: NDArray[np.intp]) -> Array:
-        """Return V(od) of the setpoint with index `row`; `od` and `row` broadcast."""
+        """Return V(od) for the setpoint with index `row`; `od` and `row` broadcast."""
         spacing = self.log_od[1] - self.log_od[0]
         position = np.clip((np.log(od) - self.log_od[0]) / spacing, 0.0, self.log_od.size - 1.000001)
         left = position.astype(np.intp)
@@ -137,10 +136,10 @@ class OptimalPolicy:
         return np.asarray((1.0 - weight) * self.value[row, left] + weight * self.value[row, left + 1])
 
     def act(self, od: Array, setpoint: Array) -> NDArray[np.intp]:
-        """Return the best action by one exact look-ahead from `od`.
+        """Return the best action at `od` by an exact one-step lookahead.
 
-        Args: od: shape (N,), > 0; setpoint: shape (N,), each one of `setpoints`.
-        Raises: ValueError for an unsolved setpoint.
+        Args: od: shape (N,), > 0; setpoint: shape (N,), each contained in `setpoints`.
+        Raises: ValueError for a setpoint that is not in `setpoints`.
         """
         row = np.searchsorted(self.setpoints, setpoint - 1e-9)
         row = np.minimum(row, self.setpoints.size - 1)
@@ -148,7 +147,7 @@ class OptimalPolicy:
         if unknown.any():
             raise ValueError(
                 f"setpoint {float(np.asarray(setpoint)[unknown][0])}: the optimum was solved for "
-                f"{self.setpoints.tolist()}; solve it for this setpoint too"
+                f"{self.setpoints.tolist()}; solve for this setpoint too"
             )
         after = np.maximum(od, 1e-6)[:, None] * self.factors
         cost = (after - setpoint[:, None]) ** 2 + self.gamma * self.cost_to_go(after, row[:, None])
@@ -158,7 +157,7 @@ class OptimalPolicy:
 def _solve_one(
     setpoint: float, od: Array, left: NDArray[np.intp], weight: Array, factors: Array, gamma: float
 ) -> Array:
-    """Return V of one setpoint on the grid `od`; action a moves grid point g between left[g, a] and left[g, a] + 1."""
+    """Return V of one setpoint on the grid `od`; action a leads from point g to the point left[g, a] + weight[g, a]."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import spsolve
 
@@ -183,13 +182,12 @@ def _solve_one(
 
 
 def solve(config: EnvConfig, gamma: float = 0.99, setpoints: Array | None = None, grid: int = 6001) -> OptimalPolicy:
-    """Solve the discounted task without an end for every setpoint.
+    """Solve the discounted task without an end for every setpoint; return the optimal policy.
 
     Args:
-      config: the task, with its 17 actions and integrator.
-      gamma: discount per control step. setpoints: OD values, shape (M,); None takes the config's.
-      grid: number of points of log OD between a third of the lowest and twice the highest relevant OD.
-    Returns: the optimal policy. Raises: nothing beyond NumPy's own for absurd sizes.
+      config: the task, its actions and integrator.
+      gamma: discount factor per control step. setpoints: ODs, (M,); None: those of the config.
+      grid: number of grid points of log OD, from 0.8 times the lowest to 1.25 times the highest start or setpoint.
     """
     targets = np.unique(np.asarray(config.setpoints if setpoints is None else setpoints, dtype=np.float64))
     low = min(config.start_od[0], targets[0]) * 0.8

@@ -1,4 +1,4 @@
-"""The density with the next setpoint known ahead: what takes minutes can begin before it is asked for."""
+"""Density task with an announced setpoint change, so that a controller can start to move before the change."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,32 +13,32 @@ from envs.integrators import Array
 from envs.task import MAX_OD, EnvConfig
 from envs.vector_env import BioreactorVectorEnv
 
-FAR = 1e6  # periods: where no change is known
+FAR = 1e6  # periods to the change if no change is known
 
 
 @dataclass(frozen=True)
 class PreviewConfig(EnvConfig):
     """`env=preview`: the task of the paper with one change of the setpoint, which is announced.
 
-    Decisions are 5 min apart, so that a change is six of them ahead when it is announced.
+    With the defaults the announcement comes six decisions before the change.
     """
 
-    kind: str = setting("preview", "which task")
+    kind: str = setting("preview", "task")
     control_min: float = setting(5.0, "control period", "min", above=0.0, at_most=60.0)
     episode_steps: int = setting(12, "control steps per episode, ended by truncation", at_least=1)
-    preview_min: float = setting(30.0, "how long before it the change is announced", "min", above=0.0, at_most=1440.0)
+    preview_min: float = setting(30.0, "time between announcement and change", "min", above=0.0, at_most=1440.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(len(set(self.setpoints)) > 1, "env.setpoints", self.setpoints, "two or more, to change between")
+        require(len(set(self.setpoints)) > 1, "env.setpoints", self.setpoints, "two or more different values")
         even = self.preview_min % self.control_min == 0.0
         require(even, "env.preview_min", self.preview_min, f"a multiple of env.control_min = {self.control_min:g}")
 
 
 def passed(control_min: float, goal: Array) -> Array:
-    """Setpoint, next one and minutes to it, (..., 3), one decision later: the change comes nearer, or has come.
+    """Advance (setpoint, next setpoint, minutes to the change), (..., 3), by one decision.
 
-    Where nothing is announced, the next setpoint is the present one and the time 0.
+    Without an announcement, or after the change, the next setpoint equals the setpoint and the time is 0.
     """
     now, following, time = (goal[..., k] for k in range(3))
     left = np.maximum(time - control_min, 0.0)
@@ -46,7 +46,7 @@ def passed(control_min: float, goal: Array) -> Array:
 
 
 def program_of(control_min: float, goal: Array, steps: int) -> Array:
-    """Setpoint in force during each of the next decisions, (steps, ...), of what is announced now, (..., 3)."""
+    """Return the setpoint during each of the next decisions, (steps, ...), from the announcement `goal`, (..., 3)."""
     program = np.empty((steps, *goal.shape[:-1]))
     for k in range(steps):
         program[k], goal = goal[..., 0], passed(control_min, goal)
@@ -54,18 +54,18 @@ def program_of(control_min: float, goal: Array, steps: int) -> Array:
 
 
 def minutes_ahead(control_min: float, preview_min: float, uniform: Array) -> Array:
-    """Turn uniform numbers into times to a change: any whole number of decisions up to the preview, min."""
+    """Turn uniform numbers into times to a change, min: 1, 2, ... decisions up to the preview, equally likely."""
     return np.asarray(control_min * (1.0 + np.floor(uniform * (preview_min / control_min))))
 
 
 def half_way(now: Array, following: Array, left: Array, full: Array | float, share: Array | float) -> Array:
-    """OD on the best way to the next setpoint, `left` periods before the change (after it: negative).
+    """Return the OD on the best path to the next setpoint, `left` periods before the change (negative: after it).
 
-    Growth or full pump takes the culture there, and it is half-way when the setpoint changes. On an exponential an
-    error weighs by the time spent at it, dx / x, so with the OD m at the change the sum of squared errors before it
-    grows by (m - now)^2 / m and the sum after it falls by (following - m)^2 / m.
+    The path is pure growth or full pump and passes the mean of both setpoints at the change. Reason: on an exponential,
+    the time spent at x is proportional to dx / x. If the OD m at the change increases by dm, the sum of squared errors
+    before the change grows by (m - now)^2 dm / m and the sum after it falls by (following - m)^2 dm / m.
 
-    Args: full: what a period of full pump takes off ln OD. share: of it, that growth takes. Broadcastable to (N,).
+    Args: full: decrease of ln OD in one period of full pump. share: growth in one period, as a fraction of `full`.
     """
     direction = np.sign(following - now)
     speed = full * np.where(direction > 0.0, share, 1.0 - np.asarray(share))
@@ -74,18 +74,18 @@ def half_way(now: Array, following: Array, left: Array, full: Array | float, sha
 
 
 class PreviewVectorEnv(BioreactorVectorEnv):
-    """A culture held at a setpoint that changes once; when and to what is announced.
+    """Task: hold a culture at a setpoint that changes once. Time and value of the change are announced.
 
-    Dynamics, action and reward: as `BioreactorVectorEnv`; a step is judged by the setpoint in force when it begins.
+    Dynamics, action and reward: as in `BioreactorVectorEnv`; the reward uses the setpoint at the start of the step.
 
     | observation | meaning                                             | range              | unit |
     |-------------|-----------------------------------------------------|--------------------|------|
     | 0           | optical density x                                   | [0, 1000]          | -    |
     | 1           | setpoint                                            | (0, 2]             | -    |
-    | 2           | next setpoint; the present one after the change     | (0, 2]             | -    |
-    | 3           | time to the change; 0 after it                      | 0 to `preview_min` | min  |
+    | 2           | next setpoint; equals the setpoint after the change | (0, 2]             | -    |
+    | 3           | time to the change; 0 after the change              | 0 to `preview_min` | min  |
 
-    Start: x, both setpoints and the time of the change drawn from the copy's own stream.
+    Start: x, both setpoints and the time of the change are drawn from the stream of the copy.
     """
 
     default = PreviewConfig
@@ -95,7 +95,7 @@ class PreviewVectorEnv(BioreactorVectorEnv):
 
     @staticmethod
     def observations(config: Any) -> spaces.Box:
-        """As in the table, float32."""
+        """Return the space of the observations in the table, float32."""
         high = np.array([MAX_OD, 2.0, 2.0, config.preview_min], dtype=np.float32)
         return spaces.Box(low=0.0, high=high, dtype=np.float32)
 
@@ -111,6 +111,6 @@ class PreviewVectorEnv(BioreactorVectorEnv):
 
 
 class PreviewEnv(EpisodeEnv):
-    """`PreviewVectorEnv` as one environment. Version history: v0."""
+    """`PreviewVectorEnv` as a single environment. Version history: v0."""
 
     batch = PreviewVectorEnv

@@ -1,13 +1,13 @@
-"""The control task in relative coordinates, with one policy for every strain, pump, volume and control period.
+"""Control task in relative coordinates: one policy serves every strain, pump, volume and control period.
 
-With h the control period and u_max the largest pump rate, B = g u_max h / tau is the decrease of ln x in one period at
-full pump rate (g: true over calibrated flow). Then e = ln(x/r)/B is the error in periods of full pump, s = mu h / B the
-growth share, and v = u/u_max the relative pump rate:
+h is the control period, u_max the largest pump rate, g the true over the calibrated flow. B = g u_max h / tau is the
+decrease of ln x in one period of full pump. Then e = ln(x/r)/B is the error in periods of full pump, s = mu h / B the
+growth share, and v = u/u_max the relative pump rate. x' = (mu - u/tau) x (paper, equation 5), integrated exactly over
+one period, becomes
 
   e' = e + s - v
 
-which is x' = (mu - u/tau) x (paper, equation 5) integrated exactly over one period. It contains no other property of
-strain and pump. For s > 1 no pump rate holds the culture.
+No other property of strain or pump appears. For s > 1 the culture outgrows every pump rate.
 """
 
 from dataclasses import dataclass
@@ -31,11 +31,11 @@ class RelativeConfig:
     n_actions: int = setting(17, "number of pump rates, equally spaced from 0 to the largest", within=(2, 1001))
     episode_steps: int = setting(20, "control steps per episode, ended by truncation", at_least=1)
     growth_shares: tuple[float, float] = setting(
-        (0.05, 0.98), "range of s, drawn uniformly per episode", above=0.0, at_most=1.0, interval=True
+        (0.05, 0.98), "range of the growth share s, uniform per episode", above=0.0, at_most=1.0, interval=True
     )
     largest_error: float = setting(
         1.2,
-        "episodes start within +- this error; beyond it the pump runs at full rate or not at all",
+        "episodes start within +- this error; beyond it the policy uses full pump or none",
         "periods of full pump",
         within=(1.1, 100),
     )
@@ -49,27 +49,27 @@ class RelativeConfig:
 
 
 def relative_reward(error: Any) -> Any:
-    """Compute r = -e'^2 of the reached error, NumPy or tensor."""
+    """Compute the reward -e'^2 of the reached error, a NumPy array or tensor."""
     return -error * error
 
 
 def nearest_level(error: Array, growth_share: Array, n: int = 17) -> NDArray[np.intp]:
-    """Choose the level nearest to clip(e + s, 0, 1), the lower of two equally near ones (myopic controller)."""
+    """Return the index of the level nearest to clip(e + s, 0, 1), of two equally near the lower (myopic controller)."""
     wanted = np.clip(error + growth_share, 0.0, 1.0) * (n - 1)
     return np.asarray(np.ceil(wanted - 0.5).clip(0, n - 1), dtype=np.intp)
 
 
 class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
-    """A culture held at a setpoint, in relative coordinates: e' = e + s - v (module's description).
+    """Task: hold a culture at a setpoint, in relative coordinates: e' = e + s - v (docstring of this module).
 
     | observation | meaning                                        | range                | unit                 |
     |-------------|------------------------------------------------|----------------------|----------------------|
     | 0           | error e                                        | any                  | periods of full pump |
-    | 1           | growth's share of the pump s, of this episode  | `growth_shares`      | -                    |
+    | 1           | growth share s, constant during an episode     | `growth_shares`      | -                    |
 
     Action: index a of v = a / (n_actions - 1), fraction of the largest pump rate. Reward: -e'^2 of the reached error.
-    Start: e uniform within +- `largest_error`, s uniform in `growth_shares`, both from the copy's own stream.
-    End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
+    Start: e uniform within +- `largest_error`, s uniform in `growth_shares`, both from the stream of the copy.
+    End, autoreset, args and raises: as in `EpisodeVectorEnv`.
     """
 
     default = RelativeConfig
@@ -77,7 +77,7 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
 
     @staticmethod
     def observations(config: RelativeConfig) -> spaces.Box:
-        """[e, s], shape (2,), float32."""
+        """Return the space of [e, s], shape (2,), float32."""
         low, high = np.array(config.growth_shares, dtype=np.float32)
         ends = np.array([[-np.inf, low], [np.inf, high]], dtype=np.float32)
         return spaces.Box(ends[0], ends[1], dtype=np.float32)
@@ -96,6 +96,6 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
 
 
 class RelativeEnv(EpisodeEnv):
-    """`RelativeVectorEnv` as one environment. Version history: v0."""
+    """`RelativeVectorEnv` as a single environment. Version history: v0."""
 
     batch = RelativeVectorEnv

@@ -1,4 +1,4 @@
-"""Schedule of a culture: phases, each with a setpoint and a temperature, maybe with a condition and other fluids."""
+"""Schedule of a culture: phases with setpoint and temperature, and optionally an end condition and spare pumps."""
 
 import math
 import re
@@ -13,22 +13,22 @@ from conf.schema import check, require, setting
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LARGEST_OD = 2.0  # of a condition
+LARGEST_OD = 2.0  # largest level of a condition
 COMPARED = re.compile(r"od\s*(>=|<=)\s*(\d*\.?\d+)")
 ENDS = "'od >= 0.8', 'od <= 0.3', settled, or null: its minutes"
 
-PUMPS = (3, 4)  # spare ones: a second medium, an inducer or a stressor
-DOSE_ML = 0.5  # smallest dose: above what a pump of up to 1.5 mL/s delivers dependably (docs/device.md, Pumps)
-MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; the volume due in a longer one is omitted
+PUMPS = (3, 4)  # spare pumps: for a second medium, an inducer or a stressor
+DOSE_ML = 0.5  # smallest dose; pumps of up to 1.5 mL/s deliver this volume reliably (docs/device.md, Pumps)
+MADE_UP_MIN = 5.0  # longest pause of the program or the samples whose volume is delivered later; else it is omitted
 MOST_ML_H, MOST_ML = 20.0, 20.0
 GIVEN = re.compile(r"pump([34])\s+(\d*\.?\d+)\s*(mL/h|mL)", re.IGNORECASE)
 FLUIDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma between, or null"
 
 
 def bounds(text: str | None) -> tuple[float, float]:
-    """Return the OD from which, and the OD down to which a condition ends a phase; inf and -inf for none.
+    """Return (high, low): the condition ends a phase when OD >= high or OD <= low; inf or -inf where it has no level.
 
-    Args: text: "od >= LEVEL", "od <= LEVEL", "settled"; None: only its time. Raises: ValueError for any other text.
+    Args: text: "od >= LEVEL", "od <= LEVEL", "settled" or None (no condition). Raises: ValueError for any other text.
     """
     if text is None or text == "settled":
         return np.inf, -np.inf
@@ -41,9 +41,9 @@ def bounds(text: str | None) -> tuple[float, float]:
 
 
 class Conditions:
-    """The conditions of N reactors' steps, (N, P); rows shorter than P are padded with None.
+    """End conditions of the steps of N reactors, (N, P). Args: texts: as written; rows shorter than P end with None.
 
-    Attributes: given, (N, P), whether there is a condition; any, whether there is one at all; texts, as written.
+    Attributes: texts: see above. given: whether a step has a condition, (N, P). any: whether any step has a condition.
     """
 
     def __init__(self, texts: list[list[str | None]]) -> None:
@@ -54,9 +54,9 @@ class Conditions:
         self.any = bool(self.given.any())
 
     def met(self, phase: NDArray[np.intp], od: Array, settled: Mask) -> Mask:
-        """Return whether each reactor's step ends, (N,): OD at its level, or settled if required.
+        """Return whether the condition of each reactor's step is met, (N,).
 
-        Args: phase: of each reactor, >= 0. od: nan meets no condition. settled: determined by the caller.
+        Args: phase: step of each reactor, >= 0. od: OD; nan meets no condition. settled: whether the OD is settled.
         """
         row = np.arange(phase.size)
         reached = (od >= self._least[row, phase]) | (od <= self._most[row, phase])
@@ -65,7 +65,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Output:
-    """Output of one spare pump in a step: a volume per hour, or a volume at its start."""
+    """Output of one spare pump in a step: `ml_h`, mL per hour, or `ml`, mL at the start of the step."""
 
     pump: int
     ml_h: float = 0.0
@@ -73,7 +73,7 @@ class Output:
 
 
 def outputs_of(text: str | None) -> tuple[Output, ...]:
-    """Parse the outputs of a step, one per pump. Raises: ValueError for any other text, with the allowed forms."""
+    """Parse the outputs of a step, at most one per pump. Raises: ValueError with the allowed forms."""
     found = []
     for part in text.split(",") if text else []:
         said = GIVEN.fullmatch(part.strip())
@@ -89,52 +89,51 @@ def outputs_of(text: str | None) -> tuple[Output, ...]:
 
 
 class Phased:
-    """What has phases of a length in min."""
+    """Base class of a schedule of phases. minutes: length of each phase, min."""
 
     minutes: Sequence[float]
 
     @property
     def total_min(self) -> float:
-        """Length of all phases, min."""
+        """Total length of all phases, min."""
         return float(sum(self.minutes))
 
     @property
     def edges(self) -> Array:
-        """Start of each phase and the end of the last, min, shape (phases + 1,)."""
+        """Start of each phase and end of the last phase, min, shape (phases + 1,)."""
         return np.concatenate([[0.0], np.cumsum(self.minutes)])
 
 
 HEATED: list[Callable[["Scenario"], bool]] = []
-"""Whether another controller decides on the temperature of a phase that gives none; a guest adds its own."""
+"""Functions that return whether another controller sets the temperature of phases without one; guests add theirs."""
 
 
 @dataclass(frozen=True)
 class Scenario(Phased):
-    """Consecutive phases, counted from the end of the recovery.
+    """Consecutive phases; time starts at the end of the recovery.
 
-    If `until` gives a phase a condition, its minutes are a limit, and `edges` assumes that no
-    condition is met (`experiments/loop/progress.py` has the actual times). Raises: ValueError with key, value and
-    allowed range.
+    If `until` gives a phase a condition, its minutes are its longest duration. `edges` assumes that no condition is
+    met; `experiments/loop/progress.py` has the actual times. Raises: ValueError with key, value and allowed range.
     """
 
     setpoints: tuple[float, ...] = setting((0.5,), "setpoint of each phase", "OD", above=0.0, at_most=1.5)
     minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
     temperatures: tuple[float | None, ...] = setting(
-        (37.0,), "thermostat in each phase; null: as another controller decides", "degC", within=(15, 42)
+        (37.0,), "temperature in each phase; null: set by another controller", "degC", within=(15, 42)
     )
     recovery_od: float = setting(
         0.0, "OD to which the culture grows undiluted before the first phase; 0: no recovery", "OD", within=(0, 1.5)
     )
     recovery: str = setting(
         "grow",
-        "dilute: grow beyond `recovery_od` by `settled_band`, then dilute to it with full pump",
+        "grow: end at `recovery_od`; dilute: grow beyond it by `settled_band`, then dilute to it at full pump",
         choices=("grow", "dilute"),
     )
     recovery_limit_min: float = setting(600.0, "longest recovery", "min", above=0.0)
     announce_min: float | str | None = setting(
         None,
-        "time by which controllers know a change of setpoint in advance; 0: never; auto: as long as half of the change "
-        "takes by the estimate; null: 0, or what a further setpoint brings",
+        "how long in advance controllers know a change of setpoint; 0: never; auto: the estimated time for half of the "
+        "change; null: 0, or the default of a second setpoint",
         "min",
         within=(0, 1440),
         words=("auto",),
@@ -149,11 +148,11 @@ class Scenario(Phased):
     )
     settled_band: float = setting(
         0.05,
-        "settled: |OD - setpoint| within this fraction of the setpoint, as for the settling time of the summary",
+        "`settled` needs |OD - setpoint| within this fraction of the setpoint; also for the summary's settling time",
         "",
         within=(0.005, 0.5),
     )
-    settled_min: float = setting(10.0, "time without a reading outside that band", "min", within=(1, 1440))
+    settled_min: float = setting(10.0, "`settled` needs all readings in the band this long", "min", within=(1, 1440))
 
     def __post_init__(self) -> None:
         phases, *beside = lengths = [len(each) for each in (self.setpoints, self.minutes, self.temperatures)]
@@ -161,7 +160,7 @@ class Scenario(Phased):
             phases > 0 and set(beside) == {phases},
             "scenario.setpoints, minutes, temperatures",
             "lists of {}, {} and {}".format(*lengths),
-            "one or more setpoints, and as many minutes and temperatures; decimals have a point: 0.5",
+            "one or more setpoints, and equally many minutes and temperatures; decimals have a point: 0.5",
         )
         for name in ("until", "outputs"):
             texts = tuple(None if each is None or each != each else str(each) for each in getattr(self, name))
@@ -170,24 +169,24 @@ class Scenario(Phased):
         diluted = self.recovery == "grow" or self.recovery_od > 0.0
         require(diluted, "scenario.recovery_od", self.recovery_od, "> 0 with scenario.recovery=dilute")
         given = None not in self.temperatures or any(heated(self) for heated in HEATED)
-        require(given, "scenario.temperatures", self.temperatures, "numbers where nobody else decides on them")
+        require(given, "scenario.temperatures", self.temperatures, "numbers, as no other controller sets temperatures")
         for name, read in (("until", bounds), ("outputs", outputs_of)):
             self.one_each(name)
             for text in getattr(self, name):
                 read(text)
 
     def one_each(self, name: str) -> None:
-        """Check that a list is empty or has an entry for each phase. Raises: ValueError."""
+        """Check that the list `name` is empty or has an entry for each phase. Raises: ValueError."""
         given, phases = getattr(self, name), len(self.setpoints)
-        allowed = f"none or one for each of the {phases} phases"
+        allowed = f"no entry, or one for each of the {phases} phases"
         require(len(given) in (0, phases), f"scenario.{name}", given, allowed)
 
     @property
     def announced_min(self) -> float:
-        """Time by which a change is announced, min; 0: never, inf: from the start of its step on."""
+        """Time between announcement and change, min; 0: no announcement; inf: announced at the start of the step."""
         return math.inf if self.announce_min == "auto" else float(self.announce_min or 0.0)
 
     @property
     def supplied(self) -> frozenset[int]:
-        """Spare pumps of all phases."""
+        """Spare pumps that any phase uses."""
         return frozenset(output.pump for text in self.outputs for output in outputs_of(text))

@@ -1,4 +1,4 @@
-"""The control task an agent is trained on: model, control period, action grid, reward, episode (paper, section 3)."""
+"""Control task on which an agent is trained: model, control period, action grid, reward, episode (paper, section 3)."""
 
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -11,22 +11,22 @@ from envs.integrators import INTEGRATORS, Array
 T = TypeVar("T", bound=Any)
 
 MAX_PUMP_RATE = 0.02
-"""mL/s. The Chi.Bio's own regulator never exceeds a duty of 0.02 of a 1 mL/s pump (docs/device.md, Regulation)."""
+"""mL/s. The Chi.Bio's regulator never exceeds a duty of 0.02 with a 1 mL/s pump (docs/device.md, Regulation)."""
 
 MAX_OD = 1000.0
-"""Limit of the OD: 100 steps at mu = 0.1/min from OD 4 would reach 1e5."""
+"""Limit of the simulated OD: without it, 100 steps of 1 min at mu = 0.1/min from OD 4 would reach 1e5."""
 
 SCORED_OD = (0.1, 1.1)
-"""Range of the scored starts, independent of `start_od`."""
+"""Range of the initial OD in scored episodes, independent of `start_od`."""
 
 
 @dataclass(frozen=True)
 class EnvConfig:
     """Training model x' = (mu - u/tau) x, equation (5) of the paper, and its episode.
 
-    The paper reports neither mu nor tau. The nominal values are E. coli in rich medium at 37 degC with a plasmid (0.020
-    to 0.031 1/min in the literature), and a vial of 20 mL with a pump of 1 mL/s (tau = V/60). Raises: ValueError with
-    key, value and allowed range.
+    The paper reports neither mu nor tau. The nominal mu is that of E. coli with a plasmid in rich medium at 37 degC
+    (0.020 to 0.031 1/min in the literature); the nominal tau is that of a 20 mL vial and a 1 mL/s pump (tau = V/60).
+    Raises: ValueError with key, value and allowed range.
     """
 
     mu: float = setting(
@@ -63,7 +63,7 @@ class EnvConfig:
     )
     final_reward_weight: float = setting(
         1.0,
-        "weight of the final reward of equation (4); the paper gives no form, 1 counts the last state as every other",
+        "factor on the last reward of an episode (final term of equation 4; not stated in the paper)",
         at_least=0.0,
     )
 
@@ -78,10 +78,10 @@ class EnvConfig:
 def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     """Compute f with x(t + control period) = f x(t) for a constant pump rate, shape of `rates`.
 
-    The model is linear in x, so the configured integrator, run once from x = 1 with all sub-steps, gives f exactly: for
-    Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
+    The model is linear in x, so one run of the configured integrator from x = 1 gives f exactly. For Euler with step h,
+    f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all use this factor.
 
-    Args: config: the task. rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
+    Args: config: the task. rates: pump rates u, mL/s, any shape; None: the action grid, (A,).
     """
     u = config.pump_rates() if rates is None else np.asarray(rates, dtype=np.float64)
     advance = INTEGRATORS[config.integrator]
@@ -89,10 +89,9 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
 
 
 def tracking_reward(od: T, setpoint: T) -> T:
-    """Compute r = -(x - setpoint)^2 (paper, equation 4) of the OD after the step.
+    """Compute the reward -(x - setpoint)^2 (paper, equation 4) from the OD x after the step.
 
-    Args: od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
-    Returns: shape of the broadcast. Raises: nothing.
+    Args: od: x, any shape, a NumPy array or tensor. setpoint: same type, broadcastable shape.
     """
     error: T = od - setpoint
     reward: T = -error * error

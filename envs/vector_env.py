@@ -17,25 +17,25 @@ from conf.schema import build, require
 from envs.integrators import Array
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
-C = TypeVar("C", bound=Any)  # the task's config dataclass
+C = TypeVar("C", bound=Any)  # config dataclass of the task
 EPISODES_PER_BLOCK = 64
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
-    """Return actions as an array of `shape`. Raises: ValueError unless they are integers from 0 to n_actions - 1."""
+    """Return the actions as an array of `shape`. Raises: ValueError unless all are integers from 0 to n_actions - 1."""
     given = np.asarray(actions)
     if given.shape != shape or given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= n_actions:
         raise ValueError(
             f"action {reprlib.repr(given.tolist())} of shape {given.shape} and type {given.dtype}: allowed "
-            f"0 to {n_actions - 1} (index of a pump rate), integers of shape {shape}"
+            f"integers from 0 to {n_actions - 1} (indices of pump rates) of shape {shape}"
         )
     return given
 
 
 class EpisodeSpec:
-    """`spec` of an environment with a `config`: Gymnasium's, with the length of episodes; no rendering.
+    """Base class that adds the episode length to Gymnasium's `spec` and does not render.
 
-    Environments truncate by themselves, so no time limit is registered.
+    The environments truncate their episodes, so no time limit is registered with Gymnasium.
     """
 
     config: Any
@@ -43,7 +43,7 @@ class EpisodeSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's spec, with the episode's length."""
+        """Gymnasium's spec with the length of an episode."""
         return self._spec
 
     @spec.setter
@@ -51,7 +51,7 @@ class EpisodeSpec:
         self._spec = None if value is None else replace(value, max_episode_steps=self.config.episode_steps)
 
     def render(self) -> None:
-        """Return None and warn, as Gymnasium's environments do without a `render_mode`."""
+        """Warn that nothing is drawn, as Gymnasium's environments do without a `render_mode`."""
         logger.warn("this environment has nothing to draw; plot what `reset` and `step` return")
 
 
@@ -59,7 +59,7 @@ class EpisodeStreams:
     """Uniform numbers for each episode of each copy (start, setpoint), from one generator per copy.
 
     Copy i draws the same numbers for every N. Numbers are drawn in blocks, so a reset of thousands of copies needs no
-    Python loop. The state has the generators before their block and the position of each copy in it.
+    Python loop. The saved state has each generator before its block and the position of each copy in its block.
     """
 
     def __init__(self, seeds: Sequence[int | np.random.SeedSequence], numbers: int = 2) -> None:
@@ -76,7 +76,7 @@ class EpisodeStreams:
         self._position[copies] = 0
 
     def take(self, copies: NDArray[np.intp]) -> Array:
-        """Return numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
+        """Return the numbers in [0, 1) for the next episode of each of `copies`, shape (len(copies), numbers)."""
         used_up = copies[self._position[copies] == EPISODES_PER_BLOCK]
         if used_up.size:
             self._refill(used_up)
@@ -85,7 +85,7 @@ class EpisodeStreams:
         return numbers
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue; plain numbers and lists."""
+        """Return the state needed to continue, as plain numbers and lists."""
         return {"generators": list(self._states), "position": self._position.tolist()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -96,25 +96,25 @@ class EpisodeStreams:
 
 
 class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
-    """N copies of a task with episodes of fixed length; a task defines how they begin and advance.
+    """N copies of a task with episodes of fixed length. A subclass defines how episodes begin and advance.
 
-    `state` (N, O) holds every copy's observation in full precision: the state, and the goal or parameter.
+    `state` (N, O) contains the observation of each copy in full precision: the state, and the goal or parameter.
     End: never terminated; truncated after `config.episode_steps` steps (bootstrapping continues).
-    Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
-    the next step ignores its action and starts the next episode, with reward 0 (Gymnasium's stateful wrappers).
+    Autoreset: with SAME_STEP, infos["final_obs"] contains the last observation of each ended episode. With NEXT_STEP,
+    the next step ignores its action and starts the next episode with reward 0 (for Gymnasium's stateful wrappers).
 
     Args:
-      num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
+      num_envs: N >= 1. config: the task; overrides: values to change in it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
-      render_mode: None; there is no drawing. max_episode_steps: Gymnasium's name; ends episodes that are longer.
-      continuous: actions are numbers from 0 to 1, shape (N, 1), in the place of indices: anywhere on the grid's range.
-    Raises: ValueError with the invalid value, or an unknown key and the known ones; TypeError for a `render_mode`.
+      render_mode: only None, as nothing is drawn. max_episode_steps: limit of `episode_steps`, given by Gymnasium.
+      continuous: whether actions are numbers from 0 to 1, (N, 1), positions in the grid's range, instead of indices.
+    Raises: ValueError for an invalid value or an unknown key; TypeError for a `render_mode`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
     default: type[C]
     names: tuple[str, ...]
-    """Names of the observation's numbers, in order; options of a reset may set them."""
+    """Names of the observation's numbers, in order; the options of `reset` use them."""
     numbers = 2
     """Number of uniform numbers for the start of an episode."""
 
@@ -160,10 +160,10 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     @staticmethod
     @abstractmethod
     def observations(config: C) -> spaces.Box:
-        """Space of one copy's observations."""
+        """Return the space of one copy's observations."""
 
     def _prepare(self) -> None:
-        """Prepare the task once."""
+        """Prepare values that the task needs in every step; called once."""
 
     @abstractmethod
     def _begun(self, numbers: Array) -> Array:
@@ -171,21 +171,21 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
     @abstractmethod
     def _advance(self, actions: NDArray[Any]) -> Array:
-        """Advance `state` by one period; return the rewards (N,). Args: actions: indices, or numbers from 0 to 1."""
+        """Advance `state` by one period; return the rewards (N,). Args: actions: indices or numbers from 0 to 1."""
 
     def _weigh(self, last: Array) -> Array:
-        """Return the rewards of the last steps of episodes, (K,)."""
+        """Return the weighted rewards of the last steps of K episodes, (K,)."""
         return last
 
     @classmethod
     def seeded(cls, config: C, seeds: Sequence[np.random.SeedSequence]) -> Self:
-        """Make one copy per seed."""
+        """Create an environment with one copy per seed."""
         env = cls(len(seeds), config)
         env.seed_streams(seeds)
         return env
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
-        """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
+        """Create the random stream of each copy; `reset(seed=...)` does this with seed, seed + 1, ..."""
         self._streams = EpisodeStreams(seeds, self.numbers)
 
     def _start(self, copies: NDArray[np.intp]) -> None:
@@ -204,8 +204,8 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
         Args:
           seed: an integer (copy i gets seed + i), one integer or None per copy, or None to continue the streams.
-          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` sets the
-          start instead of a random draw, {"od": 0.3, "setpoint": 0.5}.
+          options: {"reset_mask": bool array (N,)} restarts only these copies; {NAME: number or (N,)} with NAME from
+          `names` replaces a random start value, {"od": 0.3, "setpoint": 0.5}.
         Returns: observations (N, O), {}.
         Raises: ValueError for a mask of another shape, an unknown option or a value out of range.
         """
@@ -226,7 +226,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return self._observe(), {}
 
     def _given(self, name: str, value: Any) -> tuple[int, Array]:
-        """Return column and values (N,) of a start given to a reset. Raises: ValueError."""
+        """Return column and values (N,) of a start value in the options of `reset`. Raises: ValueError."""
         space, names = self.observations(self.config), self.names[: self.state.shape[1]]
         require(name in names, "reset option", name, ", ".join(("reset_mask", *names)))
         low, high = float(space.low[names.index(name)]), float(space.high[names.index(name)])
@@ -240,9 +240,9 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Advance every copy by one control period.
 
-        Args: actions: indices of the action grid, shape (N,), integers; `continuous`: numbers from 0 to 1, (N, 1).
-        Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
-        infos["final_obs"] (N, O) has the last observations of ended episodes and infos["_final_obs"] (N,) their mask.
+        Args: actions: indices of the action grid, integers, (N,); if `continuous`, numbers from 0 to 1, (N, 1).
+        Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos. With SAME_STEP,
+        infos["final_obs"] (N, O) has the last observations of ended episodes; infos["_final_obs"] (N,) is their mask.
         Raises: RuntimeError before the first reset; ValueError for actions of another shape or outside the grid.
         """
         if self._streams is None:
@@ -257,7 +257,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
 
     def checked(self, actions: Any, copies: tuple[int, ...]) -> NDArray[Any]:
-        """Check actions, indices or numbers from 0 to 1; returns the shape of `copies`. Raises: ValueError."""
+        """Check actions, indices or numbers from 0 to 1; return them in the shape `copies`. Raises: ValueError."""
         if not self.continuous:
             return checked_actions(actions, copies, self.config.n_actions)
         given = np.asarray(actions, dtype=np.float64)
@@ -266,7 +266,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return given[..., 0]
 
     def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
-        """Weight the last reward of ended episodes in place, begin the next ones or let them wait; return infos."""
+        """Weight the last reward of ended episodes in place; begin or schedule the next episodes; return infos."""
         reward[truncated] = self._weigh(reward[truncated])
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._waiting = truncated.copy()
@@ -276,7 +276,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return {**infos, **{f"_{key}": truncated.copy() for key in infos}}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue to the bit on one processor; plain numbers and lists."""
+        """Return the state needed to continue bit for bit on one processor, as plain numbers and lists."""
         assert self._streams is not None, "reset before state_dict"
         return {
             "state": self.state.tolist(),
@@ -295,7 +295,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
 
 class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
-    """A culture at a setpoint, with a choice of the pump rate every control period (paper, sections 2 and 3).
+    """Task: hold a culture at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
 
     Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
 
@@ -305,9 +305,9 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
     | 1           | setpoint of this episode      | (0, 2]     | -    |
 
     Action: index a of the pump rate u = a / (n_actions - 1) * max_pump_rate, mL/s.
-    Reward: -(x - setpoint)^2 of the x reached; in the last step times `final_reward_weight`.
-    Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the copy's own stream.
-    End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
+    Reward: -(x - setpoint)^2 with the reached x; in the last step times `final_reward_weight`.
+    Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the stream of the copy.
+    End, autoreset, args and raises: as in `EpisodeVectorEnv`.
     """
 
     default = EnvConfig
@@ -315,7 +315,7 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:
-        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is limited to the range of a sensor."""
+        """Return the space of [x, setpoint], shape (2,), float32: x from 0 to `MAX_OD`, setpoint from 0 to 2."""
         return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
 
     def _prepare(self) -> None:
@@ -324,12 +324,12 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
 
     @property
     def od(self) -> Array:
-        """True x, (N,)."""
+        """True OD x, (N,)."""
         return self.state[:, 0]
 
     @property
     def setpoint(self) -> Array:
-        """Of the running episode, (N,)."""
+        """Setpoint of the current episode, (N,)."""
         return self.state[:, 1]
 
     def _begun(self, numbers: Array) -> Array:

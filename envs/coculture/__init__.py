@@ -1,4 +1,4 @@
-"""Two species in one vial, whose composition follows the temperature: rates, task, optimum.
+"""Two species in one vial whose composition depends on the temperature: rates, task, optimum.
 
-Pure numerics; anybody may enter. The plant is in `envs/plant`, what decides on a reactor in `experiments/laws/density`.
+The package contains pure numerics. The simulated vial is in `envs/plant`, controllers are in `experiments/coculture`.
 """

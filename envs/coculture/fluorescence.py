@@ -1,7 +1,7 @@
-"""The fluorescent pigment of the second of two species, as pyoverdine of P. putida, and the sensor of its light.
+"""Fluorescent pigment of the second species (pyoverdine of P. putida) and the sensor of its light.
 
 Source of the equations and numbers: Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025); its public model
-Janmorlock/CompEst3000 (MIT). Light is counted as the device's base times its first emission: counts of one band.
+Janmorlock/CompEst3000 (MIT). A reading is the device's base times its first emission: the counts of one band.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ DAY_MIN = 1440.0
 
 @dataclass(frozen=True)
 class FluorescenceConfig:
-    """The sensor: y = k (f + od_term OD) + offset with pigment f; the defaults are a calibrated reactor, with noise.
+    """Sensor y = k (f + od_term OD) + offset with pigment f; the default is calibrated, with noise.
 
-    Seventeen real reactors had k 0.75 to 1.19 (mean 0.99) and offsets of 151 to 339 (mean 214).
+    Seventeen real reactors had k from 0.75 to 1.19 (mean 0.99) and offsets from 151 to 339 (mean 214).
     """
 
     factor: tuple[float, float] = setting(
@@ -33,10 +33,10 @@ class FluorescenceConfig:
     offset: tuple[float, float] = setting(
         (214.0, 214.0), "range of the offset, drawn uniformly per reactor", "counts", within=(0, 5000), interval=True
     )
-    od_term: float = setting(150.0, "light per OD that any cells scatter into the band", "counts/OD", within=(0, 5000))
-    noise_sd: float = setting(30.0, "sd of a reading", "counts", within=(0, 1000))
+    od_term: float = setting(150.0, "light that cells scatter into the band, per OD", "counts/OD", within=(0, 5000))
+    noise_sd: float = setting(30.0, "standard deviation of a reading", "counts", within=(0, 1000))
     drift_per_day: float = setting(
-        0.0, "largest relative drift of k, drawn uniformly in +- this", "1/day", within=(0, 0.5)
+        0.0, "relative drift of k is drawn uniformly within +- this", "1/day", within=(0, 0.5)
     )
     ageing_per_day: float = setting(0.0, "relative loss of lamp light", "1/day", within=(0, 0.5))
     saturation: float = setting(
@@ -48,18 +48,18 @@ class FluorescenceConfig:
 
 
 class FluorescenceSensor:
-    """N vials' pigment and sensors.
+    """Pigment and fluorescence sensors of N vials.
 
       f' = g p - D f          pigment; p is the OD of the second species, D the dilution rate
-      g' = follow (g_ss(T) - g(t - delay)),  g >= least    its production rate, a damped oscillation about g_ss
+      g' = follow (g_ss(T) - g(t - delay)),  g >= least    production rate, a damped oscillation about g_ss
 
-    g takes one step per minute. f is exact for constant p and D over the interval.
+    g is integrated with one step per minute. f is exact for constant p and D over the interval.
 
     Args:
-      config: the sensor; rngs: one stream per vial, for its constants and for the readings.
+      config: the sensor; rngs: one stream per vial, for its constants and its readings.
       pair: the two species.
-    State, shape (N,): `pigment` (counts), `production` (counts per hour and OD). Fault switches, bool, shape (N,), in
-    rising precedence: `dead` (reads 0), `saturated`, `frozen`.
+    State, shape (N,): `pigment` (counts), `production` (counts per hour and OD). Fault switches, bool, shape (N,):
+    `dead` (reads 0), `saturated` (overrides dead), `frozen` (overrides both).
     """
 
     strain = 1
@@ -77,9 +77,9 @@ class FluorescenceSensor:
         self._tape = Tape(reading, normals=1, uniforms=0)
 
     def reset(self, producers: Array, growth: Array, temperature: Array) -> None:
-        """Set pigment and production in balance with undiluted growth: f = g_ss p / mu.
+        """Set pigment and production to the balance of undiluted growth: f = g_ss p / mu.
 
-        Args: producers: OD of P. putida; growth: its rate, 1/min (none: no pigment); temperature: degC; shape (N,).
+        Args: producers: OD of the second species; growth: its rate, 1/min (0: no pigment); temperature: degC; (N,).
         """
         self.production: Array = self._pair.production(temperature)
         self._past = np.tile(self.production, (self._pair.pigment.delay_min, 1))
@@ -88,7 +88,7 @@ class FluorescenceSensor:
         self._last = np.full(producers.size, np.nan)
 
     def new_minute(self, temperature: Array) -> None:
-        """Advance production by a minute at `temperature`, degC, shape (N,)."""
+        """Advance the production by one minute at `temperature`, degC, shape (N,)."""
         pigment = self._pair.pigment
         steady = self._pair.production(temperature)
         wanted = self.production + pigment.follow_per_h / 60.0 * (steady - self._past[0])
@@ -96,12 +96,12 @@ class FluorescenceSensor:
         self.production = np.maximum(wanted, pigment.least)
 
     def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
-        """Advance production and dilution of pigment over an interval.
+        """Advance the pigment over an interval: production, dilution, evaporation.
 
         Args:
-          minutes: its length, min. producers: OD of P. putida, mean of the interval.
-          kept: fraction left by a dose at its start; dilution: 1/min, during it; concentrated: by evaporation, at its
-            end; all of shape (N,).
+          minutes: length of the interval, min. producers: mean OD of the second species in the interval.
+          kept: fraction left by a dose at the start; dilution: dilution rate, 1/min; concentrated: factor of the
+            concentrations by evaporation, applied at the end; all of shape (N,).
         """
         gone = -np.expm1(-dilution * minutes)
         duration = np.divide(gone, dilution, out=np.full_like(gone, minutes), where=dilution > 0.0)
@@ -111,7 +111,7 @@ class FluorescenceSensor:
     def apparent(self, od: Array, minutes: float) -> Array:
         """Compute the reading of a noise-free sensor, counts, shape (N,).
 
-        Args: od: of all cells, shape (N,); minutes: age of the calibration, min.
+        Args: od: total OD of all cells, shape (N,); minutes: age of the calibration, min.
         """
         days, d = minutes / DAY_MIN, self.draws
         factor = d["fluorescence_factor"] * np.maximum(1.0 + d["fluorescence_drift_per_day"] * days, 0.0)
@@ -119,7 +119,7 @@ class FluorescenceSensor:
         return np.asarray(factor * (self.pigment + self.config.od_term * od) + d["fluorescence_offset"])
 
     def read(self, od: Array, minutes: float) -> Array:
-        """Take one reading with all errors and faults, counts; arguments as `apparent`, shape (N,)."""
+        """Take one reading with all errors and faults, counts, shape (N,). Args: as in `apparent`."""
         c = self.config
         (z,), _ = self._tape.next()
         value = np.clip(self.apparent(od, minutes) + c.noise_sd * z, 0.0, c.saturation)

@@ -1,4 +1,4 @@
-"""How two species enter the simulated world."""
+"""Registration of two species in the simulation: environments, plant settings, strain, sensor, option `pair`."""
 
 from conf import schema
 from envs.coculture.pair import named_pair
@@ -15,6 +15,6 @@ schema.add(PlantConfig, OfPlant)
 strains.add_law("pair", lambda config, activation, number: of_plant(config).pair.curve(number))
 plant.STRAINS.append(strain)
 plant.LIGHTS.append(sensor)
-plant.TOLD["pair"] = (
-    "ecoli_pputida", "of two species: a preset or a pair.yaml", lambda config, name: of_pair(config, named_pair(name))
+plant.OPTIONS["pair"] = (
+    "ecoli_pputida", "the two species: a preset or a pair.yaml", lambda config, name: of_pair(config, named_pair(name))
 )  # fmt: skip

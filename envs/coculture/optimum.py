@@ -1,12 +1,12 @@
-"""The best possible composition controllers, by dynamic programming, for any program known ahead.
+"""Optimal composition controllers for any known sequence of setpoints, by dynamic programming.
 
-State: logit x of the share, temperature T, lagged rate m. On a grid of all three, the cost-to-go is linear in every
-cell, and what an action does to the grid is one sparse matrix. Backward induction (Bellman 1957) over the decisions
-that are left:
+State: logit x of the share, temperature T, lagged growth rate m. The cost-to-go V is stored on a grid of these three
+and is linear within each cell. The effect of an action on the whole grid is one sparse matrix. Backward induction
+(Bellman 1957) over the remaining decisions:
 
   V_k = min_a [(r'_a - s_k)^2 + V_{k+1}(x'_a, T'_a, m'_a)],     V_K = 0
 
-with s_k the setpoint in force during decision k. Greedy actions look one decision ahead by the exact model.
+with s_k the setpoint during decision k. The greedy action uses the exact model for one decision and V after it.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grid:
-    """Points of logit share, temperature and lagged rate on which values are kept. logit_span: largest |x|."""
+    """Numbers of grid points in logit share x, temperature and lagged rate. logit_span: largest |x|."""
 
     logits: int = 161
     temperatures: int = 15
@@ -34,7 +34,7 @@ class Grid:
     logit_span: float = 6.0
 
     def axes(self, config: CocultureConfig) -> tuple[Array, Array, Array]:
-        """Points of T, m, x, in the order of a value's axes."""
+        """Return the grid points of T, m and x, in the order of the axes of V."""
         rate = config.scale_p * config.pair.rates(np.linspace(*config.span, 71))[:, 1]
         return (
             np.linspace(config.span[0], config.pair.temperatures[1], self.temperatures),
@@ -45,9 +45,9 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """What every action makes of every grid point.
+    """Effect of every action at every grid point; G grid points, A actions.
 
-    share: r' after the decision, (A, G). matrix: values after the decision from values on the grid, (A G, G).
+    axes: points of T, m, x. share: r' after the decision, (A, G). matrix: V on the grid -> V after actions, (A G, G).
     """
 
     axes: tuple[Array, Array, Array]
@@ -55,7 +55,7 @@ class Transitions:
     matrix: "csr_array"
 
     def value_at(self, value: Array, state: Array) -> Array:
-        """V at states (N, A, 3); of one program, (G,), or of one program per state, (G, N)."""
+        """Interpolate V at states (N, A, 3); value: V of one program, (G,), or of one program per state, (G, N)."""
         index, weight = _corners(self.axes, state)
         if value.ndim == 1:
             return np.asarray((value[index] * weight).sum(axis=-1))
@@ -64,7 +64,7 @@ class Transitions:
 
 
 def _corners(axes: tuple[Array, Array, Array], state: Array) -> tuple[NDArray[np.int32], Array]:
-    """Find the eight grid points around states (..., 3) and their weights, (..., 8) each."""
+    """Return the eight grid points around each state (..., 3), and their weights, (..., 8) each."""
     cells = [_cell(state[..., k], axis) for k, axis in zip((1, 2, 0), axes, strict=True)]
     index, weight = np.empty((*state.shape[:-1], 8), dtype=np.int32), np.empty((*state.shape[:-1], 8))
     for corner in range(8):
@@ -76,7 +76,7 @@ def _corners(axes: tuple[Array, Array, Array], state: Array) -> tuple[NDArray[np
 
 
 def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
-    """Index of the grid point below and the share of the one above; values beyond the ends take the end's."""
+    """Return the index of the grid point below and the weight of the point above; beyond the axis its ends count."""
     position = np.clip((at - axis[0]) / (axis[1] - axis[0]), 0.0, axis.size - 1.0)
     left = np.minimum(position.astype(np.intp), axis.size - 2)
     return left, position - left
@@ -84,7 +84,7 @@ def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
 
 @lru_cache(maxsize=4)
 def transitions(config: CocultureConfig, grid: Grid = Grid()) -> Transitions:
-    """Tabulate the model on a grid; kept for the last few configs."""
+    """Tabulate the model on a grid; the tables of the last four configs are cached."""
     from scipy.sparse import csr_array
 
     axes = grid.axes(config)
@@ -99,7 +99,7 @@ def transitions(config: CocultureConfig, grid: Grid = Grid()) -> Transitions:
 
 
 def sweep(model: Transitions, value: Array, setpoint: Array) -> Array:
-    """V_k from V_{k+1}, both (G, B), for B programs whose setpoint is `setpoint`, shares (B,)."""
+    """Compute V_k from V_{k+1}, both (G, B), for B programs with the setpoints s_k = `setpoint`, shares, (B,)."""
     actions, points = model.share.shape
     ahead = (model.matrix @ value).reshape(actions, points, -1)
     best = np.full(value.shape, np.inf)
@@ -109,7 +109,7 @@ def sweep(model: Transitions, value: Array, setpoint: Array) -> Array:
 
 
 def cost_to_go(model: Transitions, setpoints: Array) -> Array:
-    """V_0 to V_K of programs, (K + 1, G, B). Args: setpoints: share in force during each decision, (K, B)."""
+    """Compute V_0 to V_K of B programs, (K + 1, G, B). Args: setpoints: share during each decision, (K, B)."""
     steps, programs = setpoints.shape
     value = np.zeros((steps + 1, model.share.shape[1], programs))
     for k in range(steps - 1, -1, -1):
@@ -125,10 +125,10 @@ def best_action(
     setpoint: Array,
     errors: Array | None = None,
 ) -> NDArray[np.intp]:
-    """Index of the action with the least cost of this decision and, given a value, of those after it.
+    """Return the index of the action with the smallest cost: squared error after this decision plus `value`, (N,).
 
-    Args: state: (N, 3). setpoint: share in force, (N,). value: V after this decision, (G,) or one per state, (G, N);
-      None: nothing after it counts, which is the myopic law. errors: of both growth curves, relative, (N, 2).
+    Args: state: (N, 3). setpoint: present setpoint, a share, (N,). value: V after this decision, (G,), or one per
+      state, (G, N); None: 0, the myopic controller. errors: relative errors of both growth curves, (N, 2).
     """
     own = None if errors is None else errors[:, None, :]
     after = advance(config, state[:, None, :], config.targets(), config.control_min, own)  # (N, A, 3)

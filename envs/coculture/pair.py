@@ -1,7 +1,7 @@
-"""Two species in one vial: how each grows with temperature, and the pigment of the second.
+"""Two species in one vial: the growth of each as a function of temperature, and the pigment of the second.
 
-The default is E. coli and P. putida: Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025) and its public
-model, Janmorlock/CompEst3000: fits to batch growth between 29 and 36 degC. Another one:
+The default pair is E. coli and P. putida from Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025) and its
+public model Janmorlock/CompEst3000. It was fitted to batch growth between 29 and 36 degC. For other species see
 docs/coculture.md, Another pair of species.
 """
 
@@ -18,27 +18,27 @@ from conf.schema import build, check, part, require, setting
 
 Array = NDArray[np.float64]
 
-STEPS = 71  # of temperatures between which crossings are sought
-PLAUSIBLE = (0.02, 10.0)  # 1/h, of the fastest growth; a rate per minute is not
+STEPS = 71  # number of temperatures between which crossings of the growth curves are sought
+PLAUSIBLE = (0.02, 10.0)  # range of the fastest growth rate, 1/h; a rate given per minute lies below
 FILE = "pair.yaml"
-NEEDED = ("first", "second", "pigment", "temperatures")  # of a file: nothing of another pair stands in for one
+NEEDED = ("first", "second", "pigment", "temperatures")  # keys of a file; no other pair replaces a missing one
 
 
 @dataclass(frozen=True)
 class SpeciesConfig:
-    """How a species grows with temperature: a polynomial, or the cardinal temperatures (Rosso et al. 1993).
+    """Growth rate mu of a species at temperature T: a polynomial, or cardinal temperatures (Rosso et al. 1993).
 
     mu(T) = sum_k c_k T^k
     mu(T) = mu_opt (T - t_max)(T - t_min)^2 / ((t_opt - t_min)((t_opt - t_min)(T - t_opt)
             - (t_opt - t_max)(t_opt + t_min - 2 T))),     0 outside t_min to t_max
     """
 
-    name: str = setting("E. coli", "what figures call it")
+    name: str = setting("E. coli", "name in figures")
     polynomial: tuple[float, ...] = setting(
-        (0.07727, -1.66954), "mu(T) in 1/h of T in degC, highest power first; empty: `cardinal` holds"
+        (0.07727, -1.66954), "mu(T) in 1/h of T in degC, highest power first; empty: `cardinal` is used"
     )
     cardinal: tuple[float, ...] = setting(
-        (), "lowest, best and highest temperature of growth, degC, and the rate at the best one, 1/h"
+        (), "lowest, best and highest temperature of growth, degC, and the rate at the best, 1/h"
     )
     lag_min: float = setting(2.0, "time constant with which growth follows temperature", "min", within=(0, 600))
 
@@ -55,7 +55,7 @@ class SpeciesConfig:
             require(right, f"pair, cardinal of {self.name}", self.cardinal, allowed)
 
     def rate(self, temperature: Array) -> Array:
-        """mu(T), 1/h, of a temperature in degC, any shape; not below 0."""
+        """Compute mu(T), 1/h, at temperatures in degC, any shape; at least 0."""
         if self.polynomial:
             return np.asarray(np.maximum(np.polyval(self.polynomial, temperature), 0.0))
         low, best, high, most = self.cardinal
@@ -66,27 +66,27 @@ class SpeciesConfig:
 
 @dataclass(frozen=True)
 class PigmentConfig:
-    """Pigment of the second species: f' = g p - D f.
+    """Pigment f of the second species, whose light the sensor counts: f' = g p - D f.
 
-    Its light is counted. The production g lags behind temperature:
+    The production g lags behind the temperature:
     g' = follow (g_ss(T) - g(t - delay)),  g_ss(T) = max(least, sum_k c_k (T - centre)^k),  g >= least.
     """
 
-    polynomial: tuple[float, ...] = setting(  # the other order would reach 900 000 at 29 and 36 degC, and 100 between
+    polynomial: tuple[float, ...] = setting(  # in reverse order they would give 900 000 at 29 and 36 degC
         (44.49572512791427, 31.820479677943325, -917.5864128224449, -886.6854718162117, 6318.711894680335),
-        "g_ss in counts per hour and OD of T - centre_c in degC, highest power first",
+        "g_ss in counts per hour and OD as a function of T - centre_c in degC, highest power first",
         some=True,
     )
-    centre_c: float = setting(32.5, "temperature about which the polynomial stands", "degC", within=(0, 60))
-    least: float = setting(20.0, "least production", "counts/OD/h", above=0.0)
-    follow_per_h: float = setting(1.6, "rate with which production follows", "1/h", within=(0.01, 60))
-    delay_min: int = setting(30, "after which it feels its own change", "min", within=(1, 240))
+    centre_c: float = setting(32.5, "temperature subtracted from T in the polynomial", "degC", within=(0, 60))
+    least: float = setting(20.0, "smallest production", "counts/OD/h", above=0.0)
+    follow_per_h: float = setting(1.6, "rate at which production approaches g_ss", "1/h", within=(0.01, 60))
+    delay_min: int = setting(30, "delay of g in its equation", "min", within=(1, 240))
 
     def __post_init__(self) -> None:
         check(self, "pair.pigment")
 
     def steady(self, temperature: Array) -> Array:
-        """g_ss(T), counts per hour and OD, of a temperature in degC, any shape."""
+        """Compute g_ss(T), counts per hour and OD, at temperatures in degC, any shape."""
         return np.maximum(np.polyval(np.array(self.polynomial), temperature - self.centre_c), self.least)
 
 
@@ -95,49 +95,49 @@ P_PUTIDA = SpeciesConfig("P. putida", (-0.02208, 1.3796, -20.56996), (), 60.0)
 
 @dataclass(frozen=True)
 class PairConfig:
-    """Two species, of which the second makes the pigment. Raises: ValueError naming key, value and what is allowed."""
+    """Two species, of which the second makes the pigment. Raises: ValueError with key, value and allowed values."""
 
-    first: SpeciesConfig = part(SpeciesConfig, "the one without pigment")
-    second: SpeciesConfig = part(lambda: P_PUTIDA, "the one whose share is held")
-    pigment: PigmentConfig = part(PigmentConfig, "of the second")
+    first: SpeciesConfig = part(SpeciesConfig, "species without pigment")
+    second: SpeciesConfig = part(lambda: P_PUTIDA, "species with pigment; its share is controlled")
+    pigment: PigmentConfig = part(PigmentConfig, "pigment of the second species")
     temperatures: tuple[float, float] = setting(
-        (29.0, 36.0), "range in which the curves hold; beyond it those of the nearer end", "degC", within=(4, 60),
+        (29.0, 36.0), "range of the curves; outside, the rate at the nearer end is used", "degC", within=(4, 60),
         interval=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
         check(self, "pair")
-        require(self.first.name != self.second.name, "pair, names", self.first.name, "two that differ")
+        require(self.first.name != self.second.name, "pair, names", self.first.name, "two different names")
         lags = self.first.lag_min, self.second.lag_min
         require(lags[0] <= lags[1], "pair.first.lag_min", lags[0], f"at most pair.second.lag_min = {lags[1]:g} min")
         low, high = self.temperatures
         for k, species in enumerate((self.first, self.second)):
             for t, rate in zip(self.temperatures, self.rates(np.array(self.temperatures))[:, k], strict=True):
-                allowed = "more than 0: give pair.temperatures between which both species grow"
+                allowed = "more than 0; set pair.temperatures to a range in which both species grow"
                 require(bool(rate > 0.0), f"growth of {species.name} at {t:g} degC", f"{rate:.3g} 1/h", allowed)
             fastest, (least, most) = self.rates(np.linspace(low, high, STEPS))[:, k].max(), PLAUSIBLE
-            allowed = f"{least:g} to {most:g} 1/h; curves are per hour"
+            allowed = f"{least:g} to {most:g} 1/h; give the curves in 1/h, not in 1/min"
             require(bool(least <= fastest <= most), f"fastest growth of {species.name}", f"{fastest:.3g} 1/h", allowed)
         ends = self.faster(np.array(self.temperatures))
-        said = f"{self.first.name} and {self.second.name}, of which {self.second.name} grows by {ends[0]:+.3g} 1/h "
-        said += f"faster at {low:g} degC and by {ends[1]:+.3g} at {high:g}"
+        said = f"growth of {self.second.name} minus growth of {self.first.name} is {ends[0]:+.3g} 1/h "
+        said += f"at {low:g} degC and {ends[1]:+.3g} 1/h at {high:g} degC"
         allowed = (
-            "two of which the other one is faster at the other end, or no temperature holds a share: where the curves "
-            "cross outside, record both there and widen pair.temperatures; where they cross nowhere, take other species"
+            "opposite signs, else no temperature holds a share; if the curves cross outside this range, record both "
+            "species there and widen pair.temperatures; if they cross nowhere, use other species"
         )
         require(bool(ends[0] * ends[1] < 0.0), "pair", said, allowed)
 
     def rates(self, temperature: Array | float) -> Array:
-        """Rates of both, 1/h, (..., 2), at temperatures in degC, (...)."""
+        """Compute the growth rates of both species, 1/h, (..., 2), at temperatures in degC, (...)."""
         t = np.clip(np.asarray(temperature, dtype=np.float64), *self.temperatures)
         return np.stack([self.first.rate(t), self.second.rate(t)], axis=-1)
 
     def curve(self, species: int) -> Callable[[Array], Array]:
-        """Rate of the first (0) or the second (1) species, 1/h, of temperatures in degC."""
+        """Return the function temperatures, degC -> growth rates, 1/h, of the first (0) or second (1) species."""
         return lambda temperature: self.rates(temperature)[..., species]
 
     def faster(self, temperature: Array) -> Array:
-        """By how much the second grows faster, 1/h, shape of the temperatures."""
+        """Compute the growth rate of the second species minus that of the first, 1/h, shape of the temperatures."""
         rates = self.rates(temperature)
         return np.asarray(rates[..., 1] - rates[..., 0])
 
@@ -147,29 +147,29 @@ class PairConfig:
 
     @property
     def raising(self) -> float:
-        """The end of the range at which the second species gains, degC; at the other one it loses."""
+        """End of the temperature range at which the share of the second species rises, degC."""
         low, high = self.temperatures
         return low if self.faster(np.array(low)) > self.faster(np.array(high)) else high
 
     @property
     def lowering(self) -> float:
-        """The end of the range at which the second species loses, degC."""
+        """End of the temperature range at which the share of the second species falls, degC."""
         return sum(self.temperatures) - self.raising
 
     @property
     def even_c(self) -> float:
-        """Temperature at which both grow alike, degC."""
+        """Temperature at which both species grow equally fast, degC."""
         return float(self.even(np.zeros((1, 2)))[0])
 
     @property
     def resting_c(self) -> float:
-        """The same to a tenth of a degree, as one sets a thermostat."""
+        """`even_c` rounded to 0.1 degC, the resolution of a thermostat."""
         return round(self.even_c, 1)
 
     def first_at(self, rate: Array) -> Array:
-        """Temperature at which the first species grows at a rate, 1/h, by its curve, degC, shape of the rates.
+        """Return the temperature at which the first species grows at `rate`, 1/h, by its curve, degC, same shape.
 
-        Of the stretch about `even_c` on which the curve only rises or only falls; beyond its rates the stretch's ends.
+        Only the monotonic part of the curve around `even_c` is used. Rates beyond this part give its ends.
         """
         t = np.linspace(*self.temperatures, 10 * STEPS)
         curve = self.rates(t)[:, 0]
@@ -182,10 +182,10 @@ class PairConfig:
         return np.asarray(np.interp(rate, curve[stretch][::rising], t[stretch][::rising]))
 
     def even(self, errors: Array) -> Array:
-        """Temperature at which both grow alike, degC, (N,), if the curves are off by relative errors, (N, 2).
+        """Return the temperature at which both species grow equally fast, degC, (N,).
 
-        Of several the one next to the warm end; the end of the range where there is none, at which they differ less.
-        """
+        If there are several, return the warmest; if there is none, the end of the range where the rates differ less.
+        Args: errors: relative errors of both curves, (N, 2)."""
         t = np.linspace(*self.temperatures, STEPS)
         rates = self.rates(t) * (1.0 + errors[:, None, :])
         gap = rates[..., 1] - rates[..., 0]  # (N, T)
@@ -199,9 +199,9 @@ class PairConfig:
 
 
 def named_pair(name: str) -> PairConfig:
-    """Load a pair by its preset in conf/strains, from a YAML file like these, or from a folder with pair.yaml.
+    """Load a pair from a preset of conf/strains, from a YAML file of the same form, or from a folder with pair.yaml.
 
-    Raises: ValueError naming the presets, or the file and what is wrong with it.
+    Raises: ValueError with the known presets, or with the file and the reason.
     """
     known = presets.groups()["strains"]
     if name in known:
@@ -217,9 +217,9 @@ def named_pair(name: str) -> PairConfig:
         why = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise ValueError(f"pair = {name}: {why}; give the pair.yaml of a calibration") from None
     if not isinstance(content, Mapping):
-        raise ValueError(f"pair = {name}: holds no key: value pairs; give the pair.yaml of a calibration")
+        raise ValueError(f"pair = {name}: the file has no keys with values; give the pair.yaml of a calibration")
     for key in NEEDED:
-        require(key in content, f"pair = {path}", f"no {key}", f"{', '.join(NEEDED)}; pigment: {{}} is P. putida's")
+        require(key in content, f"pair = {path}", f"no {key}", f"{', '.join(NEEDED)}; pigment: {{}} uses P. putida's")
     for key in ("first", "second"):
         given = content[key] if isinstance(content[key], Mapping) else {}
         whole = "name" in given and ("polynomial" in given or "cardinal" in given)

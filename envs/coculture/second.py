@@ -1,4 +1,4 @@
-"""Two species in the simulated vials: what the config of a plant has of them, and the strain that it comes to."""
+"""Two species in simulated vials: their settings in the config of a plant, and the strain and sensor made from them."""
 
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -18,35 +18,35 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SecondSpeciesConfig:
-    """A second species in the same medium; by default there is none.
+    """Second species in the same medium; by default there is none.
 
-    It shares substrate, yield, k_s and wall constants with the first, and whatever changes growth with time: drift,
-    ramp, the knots over their mean, the stirrer.
+    Both species share substrate, yield, k_s and wall constants. They also share every change of growth with time:
+    drift, ramp, knots (relative to their mean), stirrer.
     """
 
     start_share: tuple[float, float] = setting(
         (0.0, 0.0),
-        "its share of the OD at reset, drawn once per vial between these; [0, 0]: there is no second species",
+        "range of its share of the OD at reset, drawn once per vial; [0, 0]: no second species",
         within=(0, 1),
         interval=True,
     )
     mu: float = setting(0.008, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
-    mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
-    temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
-    activation_kj_mol: float = setting(56.0, "Ea of the Arrhenius law", "kJ/mol", within=(0, 150))
-    adaptation_min: float = setting(0.0, "time constant with which growth follows temperature", "min", within=(0, 120))
+    mu_cv: float = setting(0.0, "relative spread of mu between cultures", within=(0, 0.3))
+    temperature_law: str = setting("none", "temperature dependence of mu", choices=TEMPERATURE_LAWS)
+    activation_kj_mol: float = setting(56.0, "activation energy (Arrhenius)", "kJ/mol", within=(0, 150))
+    adaptation_min: float = setting(0.0, "time constant of growth after a temperature change", "min", within=(0, 120))
 
     def __post_init__(self) -> None:
         check(self, "plant.second")
 
     @property
     def present(self) -> bool:
-        """Whether there is one at all."""
+        """Whether there is a second species."""
         return self.start_share[1] > 0.0
 
 
 class OfPlant:
-    """What the config of a plant has of two species."""
+    """Settings that two species add to the config of a plant."""
 
     pair: PairConfig = part(PairConfig, "curves and pigment of two species, for temperature_law=pair")
     second: SecondSpeciesConfig = part(SecondSpeciesConfig, "a second species in the vial")
@@ -58,7 +58,7 @@ def of_plant(config: PlantConfig) -> OfPlant:
 
 
 def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
-    """Give a plant the species of another pair: each grows in proportion to its new curve as it did to its old one."""
+    """Return the config with the species of another pair; mu of each changes by new / old curve at 37 degC."""
     two = of_plant(config)
     if pair == two.pair:
         return config
@@ -70,7 +70,7 @@ def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
 
 
 def strain(config: PlantConfig, rngs: Streams) -> tuple[list[Strain], dict[str, Array]]:
-    """Return the second species, if there is one, and what was drawn of it. Args: rngs: one stream per vial."""
+    """Return [second species], or [] without one, and its random constants by name. Args: rngs: one stream per vial."""
     second = of_plant(config).second
     if not second.present:
         return [], {}
@@ -80,6 +80,6 @@ def strain(config: PlantConfig, rngs: Streams) -> tuple[list[Strain], dict[str, 
 
 
 def sensor(config: PlantConfig, rngs: Streams) -> FluorescenceSensor | None:
-    """Return the sensor of the second species' light, if there is one. Args: rngs: one stream per vial."""
+    """Return the fluorescence sensor, or None without a second species. Args: rngs: one stream per vial."""
     two = of_plant(config)
     return FluorescenceSensor(two.fluorescence, rngs, two.pair) if two.second.present else None

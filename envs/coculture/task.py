@@ -1,12 +1,12 @@
-"""The composition of two species as a control task: the temperature decides which of them grows faster.
+"""Composition of two species as a control task: the temperature determines which species grows faster.
 
-Dilution removes both alike, so that with r the share of P. putida in e + p only the growth rates move it:
+Dilution removes the same fraction of both species, so only the growth rates change the share r of P. putida:
 
   d logit(r)/dt = m_p - mu_e(T),     m_p' = (mu_p(T) - m_p) / 1 h,     T heats by 2 degC/min and cools passively
 
-The first species, E. coli, follows the temperature within 2 min, which is taken as at once. The share's logit is an
-integrator of limited rate, +.30 per hour at 29 degC and -.63 at 36, and what it needs hours for is worth beginning
-before it is asked for. The two species: envs/coculture/pair.py.
+The growth of the first species, E. coli, follows the temperature within 2 min; the model neglects this lag. The logit
+of the share is an integrator of limited rate: +0.30 per hour at 29 degC, -0.63 per hour at 36 degC. A change of the
+setpoint can take hours, so a controller gains by starting before the change. The species are in envs/coculture/pair.py.
 """
 
 from dataclasses import dataclass
@@ -25,35 +25,35 @@ from envs.vector_env import EpisodeVectorEnv
 Array = NDArray[np.float64]
 
 LOGIT, TEMPERATURE, RATE, SETPOINT, NEXT, TIME = range(6)
-"""Columns of an observation; the last two where changes are announced."""
+"""Columns of an observation; NEXT and TIME exist only if changes are announced."""
 
-SCALES = (0.5, 2.0)  # of a growth curve
-LARGEST = 20.0  # of a logit: one species is all but gone
+SCALES = (0.5, 2.0)  # allowed factors on a growth curve
+LARGEST = 20.0  # limit of |logit|, where one species has almost vanished
 
 
 @dataclass(frozen=True)
 class CocultureConfig:
-    """`env=coculture` and `env=coculture_preview`. Raises: ValueError naming key, value and allowed range."""
+    """Task `env=coculture` and `env=coculture_preview`. Raises: ValueError with key, value and allowed range."""
 
-    kind: str = setting("coculture", "which task")
-    n_actions: int = setting(17, "temperatures, equally spaced", within=(2, 1001))
+    kind: str = setting("coculture", "task")
+    n_actions: int = setting(17, "number of temperatures, equally spaced", within=(2, 1001))
     temperatures: tuple[float, float] | None = setting(
-        None, "coldest and warmest; null: the range of the pair's curves", "degC", within=(4, 60), interval=True
+        None, "range of temperatures; null: the range of the pair's curves", "degC", within=(4, 60), interval=True
     )
     pair: PairConfig = part(PairConfig, "the two species")
-    control_min: float = setting(10.0, "between decisions, whole minutes", "min", within=(1, 240))
+    control_min: float = setting(10.0, "control period, whole minutes", "min", within=(1, 240))
     episode_steps: int = setting(72, "decisions per episode, ended by truncation", at_least=1)
     preview_min: float = setting(
-        0.0, "how long before it a change of the setpoint is announced; 0: never", "min", within=(0, 1440)
+        0.0, "time between announcement and change of the setpoint; 0: no announcement", "min", within=(0, 1440)
     )
     setpoints: tuple[float, float] = setting(
-        (0.1, 0.9), "range of the share asked for", above=0.0, below=1.0, interval=True
+        (0.1, 0.9), "range of the setpoint, a share", above=0.0, below=1.0, interval=True
     )
     start_share: tuple[float, float] = setting(
         (0.05, 0.95), "range of the share at the start", above=0.0, below=1.0, interval=True
     )
-    scale_e: float = setting(1.0, "of the first species' growth curve", within=SCALES)
-    scale_p: float = setting(1.0, "of the second's", within=SCALES)
+    scale_e: float = setting(1.0, "factor on the growth of the first species", within=SCALES)
+    scale_p: float = setting(1.0, "factor on the growth of the second species", within=SCALES)
     heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
     cooling_min: float = setting(39.0, "time constant of passive cooling", "min", within=(1, 600))
     ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 40))
@@ -64,7 +64,7 @@ class CocultureConfig:
         even = self.preview_min % self.control_min == 0.0
         require(even, "env.preview_min", self.preview_min, f"a multiple of env.control_min = {self.control_min:g}")
         (low, high), (coldest, warmest) = self.span, self.pair.temperatures
-        within = f"{coldest:g} to {warmest:g} degC, where the curves of the pair hold"
+        within = f"{coldest:g} to {warmest:g} degC, the range of the pair's curves"
         require(coldest <= low and high <= warmest, "env.temperatures", self.span, within)
         require(self.ambient_c < low, "env.ambient_c", self.ambient_c, f"less than the coldest target, {low:g} degC")
 
@@ -79,25 +79,25 @@ class CocultureConfig:
 
     @property
     def columns(self) -> int:
-        """Numbers of an observation: 4, or 6 where changes are announced."""
+        """Number of columns of an observation: 4, or 6 if changes are announced."""
         return 6 if self.preview_min else 4
 
 
 def logit(r: Any) -> Any:
-    """ln(r / (1 - r)) of a share."""
+    """Return ln(r / (1 - r)) of a share r."""
     return np.log(r / (1.0 - np.asarray(r)))
 
 
 def share(x: Any) -> Any:
-    """1 / (1 + exp(-x)), the share of a logit."""
+    """Return the share 1 / (1 + exp(-x)) of a logit x."""
     return 1.0 / (1.0 + np.exp(-np.asarray(x)))
 
 
 def advance(config: CocultureConfig, state: Array, target: Array, minutes: float, errors: Array | None = None) -> Array:
-    """State (..., 3) - logit of the share, degC, m_p in 1/h - after `minutes` (whole) at a thermostat target.
+    """Advance the state (..., 3): logit of the share, temperature in degC, m_p in 1/h, by whole `minutes`.
 
-    One step a minute, rates at the mean temperature of the step. Args: target: degC, broadcastable to (...). errors:
-    of both growth curves beside the config's scales, relative, (..., 2).
+    Each step of 1 min uses the rates at its mean temperature. Args: target: of the thermostat, degC, broadcastable to
+    (...). errors: relative errors of both growth curves, in addition to the config's scales, (..., 2).
     """
     off = np.zeros(2) if errors is None else errors
     scale_e, scale_p = config.scale_e * (1.0 + off[..., 0]), config.scale_p * (1.0 + off[..., 1])
@@ -115,19 +115,19 @@ def advance(config: CocultureConfig, state: Array, target: Array, minutes: float
 
 
 def passed(config: CocultureConfig, goal: Array) -> Array:
-    """Goal columns (..., 1) or (..., 3) after one decision: an announced change comes nearer, or has come."""
+    """Advance the goal columns, (..., 1) or (..., 3), by one decision: an announced change comes closer or happens."""
     return goal if goal.shape[-1] == 1 else preview.passed(config.control_min, goal)
 
 
 def at_rest(config: CocultureConfig, x: Array, temperature: Array | float | None = None) -> Array:
-    """State (..., 3) of a culture that has been at one temperature for long; None: where both grow alike."""
+    """Return the state (..., 3) after a long time at one temperature; None: at which both grow equally fast."""
     warm = config.pair.even_c if temperature is None else temperature
     t = np.broadcast_to(np.asarray(warm, dtype=np.float64), np.shape(x))
     return np.stack([x, t, config.scale_p * config.pair.rates(t)[..., 1]], axis=-1)
 
 
 def limits(config: CocultureConfig) -> tuple[Array, Array]:
-    """Lowest and highest of every number of an observation, each (O,)."""
+    """Return the lowest and highest value of each column of an observation, each (O,)."""
     goal = logit(np.array(config.setpoints))
     rates = 10.0 * config.pair.rates(np.linspace(*config.pair.temperatures, 71))[:, 1]
     slow, fast = np.floor(rates.min()) / 10.0 * config.scale_p, np.ceil(rates.max()) / 10.0 * config.scale_p
@@ -137,7 +137,7 @@ def limits(config: CocultureConfig) -> tuple[Array, Array]:
 
 
 class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
-    """The share of P. putida held at a setpoint by choosing the vial's temperature (module's description).
+    """Task: hold the share of P. putida at a setpoint by the temperature of the vial (docstring of this module).
 
     | observation | meaning                                                     | range           | unit |
     |-------------|-------------------------------------------------------------|-----------------|------|
@@ -145,13 +145,13 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
     | 1           | temperature of the vial                                     | 24 to 36        | degC |
     | 2           | growth rate m_p of P. putida, which lags the temperature    | 0.4 to 1        | 1/h  |
     | 3           | logit of the setpoint                                       | `setpoints`     | -    |
-    | 4           | logit of the next setpoint; the present one if none is known| `setpoints`     | -    |
-    | 5           | time to that change; 0 if none is known                     | 0 to `preview_min` | min |
+    | 4           | logit of the next setpoint, or of the setpoint if unknown   | `setpoints`     | -    |
+    | 5           | time to the change; 0 if unknown                            | 0 to `preview_min` | min |
 
-    Columns 4 and 5 with `preview_min` > 0 only. Action: index of a thermostat target, equally spaced.
-    Reward: -(r - setpoint)^2 of the share reached and the setpoint that was in force.
-    Start: r, temperature, setpoints and the time of the change uniform, from the copy's own stream; m_p as if the
-    temperature had been that for long. End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
+    Columns 4 and 5 exist only with `preview_min` > 0. Action: index of a thermostat target; these are equally spaced.
+    Reward: -(r - setpoint)^2 with the reached share r and the setpoint before the step.
+    Start: r, temperature, setpoints and time of the change are uniform, from the stream of the copy; m_p is in balance
+    with the temperature. End, autoreset, args and raises: as in `EpisodeVectorEnv`.
     """
 
     default = CocultureConfig
@@ -160,7 +160,7 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
 
     @staticmethod
     def observations(config: CocultureConfig) -> spaces.Box:
-        """As in the table, float32."""
+        """Return the space of the observations in the table, float32."""
         low, high = limits(config)
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
@@ -190,6 +190,6 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
 
 
 class CocultureEnv(EpisodeEnv):
-    """`CocultureVectorEnv` as one environment. Version history: v0."""
+    """`CocultureVectorEnv` as a single environment. Version history: v0."""
 
     batch = CocultureVectorEnv

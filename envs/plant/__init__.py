@@ -1,3 +1,3 @@
 """The simulated vial: culture, vessel, heat, pump, sensor. Batch first, NumPy only.
 
-Simulated reactors, emulator, oracle and the configs of deploy and benchmark import it."""
+Simulated reactors, the emulator, the oracle controller and the configs of deploy and benchmark use this package."""

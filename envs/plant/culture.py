@@ -1,4 +1,4 @@
-"""The culture: suspended cells, their substrate, and biomass on the wall."""
+"""Culture of a vial: suspended cells, substrate, and biomass on the wall."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Sti
 
 @dataclass(frozen=True)
 class GrowthConfig:
-    """Growth of the culture; the defaults are the training model. Every temperature response is 1 at 37 degC."""
+    """Growth of the culture; the defaults are those of the training model. Temperature responses are 1 at 37 degC."""
 
     mu: float = setting(0.03, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
     mu_cv: float = setting(0.0, "relative spread of mu between cultures", within=(0, 0.3))
@@ -30,7 +30,7 @@ class GrowthConfig:
     )
     knots_mu: tuple[float, ...] = setting(
         (),
-        "mu at those ages, with linear interpolation, constant after the last; replaces `mu`",
+        "mu at `knots_min`, linear between them, constant after the last; replaces `mu`",
         "1/min",
         within=(0, 0.1),
     )
@@ -61,22 +61,22 @@ class GrowthConfig:
     def __post_init__(self) -> None:
         check(self, "plant.growth")
         check_knots("plant.growth.knots_mu", self.knots_min, self.knots_mu)
-        require(self.mu > 0.0 or not self.knots_mu, "plant.growth.mu", self.mu, "> 0 beside knots_mu, e.g. their mean")
+        require(self.mu > 0.0 or not self.knots_mu, "plant.growth.mu", self.mu, "> 0 with knots_mu, e.g. their mean")
 
 
 class Culture:
-    """N cultures of S strains: suspended biomass x, relative substrate s, wall biomass w (OD or relative to medium).
+    """N cultures of S strains: suspended biomass x (OD), substrate s (1: fresh medium), wall biomass w (OD).
 
       x_i' = (m_i - D) x_i - ka x_i + kd w_i        s' = D (1 - s) - sum_i m_i x_i / Y
       w_i' = ka x_i + r m_i w_i (1 - sum_i w_i / W) - kd w_i
-      m_i  = mu_i(s) phi_i(T), times drift, stirring, `mu_factor` and its own `strain_factor`
+      m_i  = mu_i(s) phi_i(T) times drift, stirring, `mu_factor` and `strain_factor`_i
       D    = fresh medium per minute / volume
 
     Args:
-      config: growth; strains: S of them; integrate: integrator.
-    State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
-    and `stir_factor` (1 turning, 0 stopped; for a failed stirrer, not for the still phase of each cycle); and
-    `strain_factor`, (N, S).
+      config: growth; strains: the S strains; integrate: integrator.
+    State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,).
+    Fault switches: `mu_factor` (N,), `strain_factor` (N, S), and `stir_factor` (N,): 1 with a working stirrer, also in
+    the pause of each measuring cycle, 0 with a failed one.
     """
 
     def __init__(self, config: GrowthConfig, strains: Sequence[Strain], integrate: Integrator) -> None:
@@ -87,9 +87,9 @@ class Culture:
         self.strain_factor = np.ones((self._n, len(strains)))
 
     def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
-        """Start a new culture in balance with its medium.
+        """Start a new culture; the substrate is reduced by what the biomass has used.
 
-        Args: OD and degC, scalar or shape (N,). share: share of the second strain, as `od`; None: as drawn.
+        Args: od: OD, temperature: degC, share: share of the second strain, None: as drawn; each scalar or (N,).
         """
         total = np.broadcast_to(od, (self._n,)).copy()
         others = [strain.share for strain in self.strains[1:]]
@@ -112,29 +112,29 @@ class Culture:
 
     @property
     def share(self) -> Array:
-        """Share of the second strain, shape (N,); nan without one or without biomass."""
+        """Share of the second strain, shape (N,); nan without second strain or biomass."""
         if len(self.strains) == 1:
             return np.full(self._n, np.nan)
         od = self.od
         return np.asarray(np.divide(self.biomass[:, 1], od, out=np.full(self._n, np.nan), where=od > 0.0))
 
     def new_minute(self, z: Array) -> None:
-        """Set the random draw of this minute: standard normal, shape (N,)."""
+        """Set the random draw of the new minute: standard normal, shape (N,)."""
         self._log_drift = self._log_drift + self.config.drift_sd_per_h / np.sqrt(60.0) * z
 
     def dilute(self, kept: Array) -> None:
-        """Dilute: fresh medium leaves the fraction `kept`, shape (N,), of the vial's content."""
+        """Dilute: a fraction `kept`, shape (N,), of the vial's content remains, the rest is fresh medium."""
         self.biomass, self.substrate = self.biomass * kept[:, None], 1.0 - (1.0 - self.substrate) * kept
 
     def concentrate(self, factor: Array) -> None:
-        """Concentrate by evaporation: concentrations rise by `factor`, shape (N,)."""
+        """Multiply the concentrations by `factor`, shape (N,), after evaporation."""
         self.biomass, self.substrate = self.biomass * factor[:, None], self.substrate * factor
 
     def grow(self, minutes: float, dilution: Array, temperature: Array, age_min: Array) -> None:
-        """Integrate x, s, w over an interval in which temperature and dilution rate are constant.
+        """Integrate x, s and w over an interval with constant temperature and dilution rate.
 
         Args:
-          dilution: 1/min; temperature: degC; age_min: of the culture, min; all of shape (N,).
+          dilution: dilution rate, 1/min; temperature: degC; age_min: age of the culture, min; all of shape (N,).
         """
         g, d = self.config, dilution[:, None]
         follow = [
@@ -165,23 +165,23 @@ class Culture:
     def rates(self, age_min: Array) -> Array:
         """Return the current specific growth rate of each strain, 1/min, shape (N, S).
 
-        Args: age_min: of the culture, min, shape (N,).
+        Args: age_min: age of the culture, min, shape (N,).
         """
         return self._rate(self.substrate[:, None]) * self._relative_rate(age_min)
 
     def _rate(self, substrate: Array) -> Array:
-        """Return rates at 37 degC, (N, S): mu, or Monod's (1949) with mu in fresh medium. Args: substrate: (N, 1)."""
+        """Return the growth rates at 37 degC, (N, S), at a substrate, (N, 1): Monod (1949), mu in fresh medium."""
         k_s = self.config.k_s
         if np.isinf(self.config.yield_od):
             return self._mu
         return np.asarray(self._mu * (1.0 + k_s) * substrate / (k_s + substrate))
 
     def _phi(self, temperature: Array) -> Array:
-        """phi_i(T) of every strain, shape (N, S)."""
+        """Return phi_i(T) of every strain, shape (N, S)."""
         return np.stack([strain.phi(temperature) for strain in self.strains], axis=1)
 
     def _relative_rate(self, age_min: Array) -> Array:
-        """Combine temperature, drift, stirring and both factors into a factor of the growth rates, shape (N, S)."""
+        """Return the factor of the growth rates by temperature, drift, stirring and fault switches, shape (N, S)."""
         g = self.config
         course = along(g.knots_min, g.knots_mu, g.mu, age_min)
         drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course
@@ -190,11 +190,11 @@ class Culture:
         return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * factors)
 
     def settle(self, minutes: float) -> None:
-        """Let cells sink without stirring, and rise again with it."""
+        """Let cells sink while the stirrer is stopped, and rise again while it turns."""
         sunk = SETTLED_FRACTION * (1.0 - self.stir_factor)
         self._settled += (sunk - self._settled) * -np.expm1(-minutes / SETTLING_MIN)
 
     @property
     def in_light_path(self) -> Array:
-        """Return the suspended biomass in the light path of the sensor, OD, shape (N,)."""
+        """Suspended biomass in the light path of the sensor, OD, shape (N,)."""
         return self.od * (1.0 - self._settled)

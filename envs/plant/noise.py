@@ -10,9 +10,9 @@ Streams = Sequence[np.random.Generator]
 
 
 def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Generator]:
-    """Return one generator per vial, n; stream i of a spawned set is the same for every n.
+    """Return n generators, one per vial. From a single generator, stream i is the same for every n.
 
-    Raises: ValueError if a sequence of another length than n is given.
+    Raises: ValueError if `rng` is a sequence whose length is not n.
     """
     if isinstance(rng, np.random.Generator):
         return rng.spawn(n)
@@ -22,7 +22,7 @@ def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Genera
 
 
 def spread(rngs: Streams, mean: Array | float, cv: Array | float) -> Array:
-    """Draw mean (1 + cv z) with z standard normal cut at three sigma, one per stream, shape (N,)."""
+    """Draw mean (1 + cv z), one per stream, shape (N,); z is standard normal, clipped at +-3."""
     z = np.clip([rng.standard_normal() for rng in rngs], -3.0, 3.0)
     return np.asarray(mean * (1.0 + cv * z), dtype=np.float64)
 
@@ -33,10 +33,10 @@ def uniform(rngs: Streams, low: float, high: float) -> Array:
 
 
 class Tape:
-    """Rows of random numbers, one row per event of all vials.
+    """Rows of random numbers for N vials; each event, e.g. a minute or a reading, takes one row.
 
     Every row has the same number of draws, used or not, so a controller cannot change later draws. Two controllers with
-    equal seeds meet equal noise (paired comparison), and vial i meets the noise of stream i for every N.
+    equal seeds meet equal noise (paired comparison), and the noise of vial i depends only on stream i.
 
     Args:
       rngs: one stream per vial.

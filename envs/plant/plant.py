@@ -1,7 +1,7 @@
-"""The plant: N vials with pumps, heater, wall and sensor, to test policies of the simple model.
+"""The plant: N simulated vials with pumps, heater, wall and sensor, to test policies trained on the simple model.
 
-It is independent of the training model except for the growth-law interface. It equals that model only with all real
-effects off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
+The plant does not use the training model. Both agree only if all real effects are off (the defaults of `PlantConfig`).
+Units: min, mL, mL/s, degC, 1/min; OD has none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ from envs.plant.vessel import Vessel, VesselConfig
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """Settings of a plant; the defaults are the preset `nominal`, the training model."""
+    """Settings of a plant; the defaults are the preset `nominal`, which equals the training model."""
 
     growth: GrowthConfig = part(GrowthConfig, "growth of the culture")
     pump: PumpConfig = part(PumpConfig, "flow of the pumps")
@@ -40,11 +40,11 @@ class PlantConfig:
     start_min: float = setting(0.0, "age of culture and pump at reset, for drifts and knots", "min", at_least=0.0)
     start_spread_min: float = setting(
         0.0,
-        "each vial is older by a uniform draw from 0 to this",
+        "extra age of each vial, drawn uniformly from 0 to this",
         "min",
         at_least=0.0,
     )
-    disturbances: tuple[str, ...] = setting((), "your own functions that act on the vials every minute, by name")
+    disturbances: tuple[str, ...] = setting((), "names of your functions that change the vials every minute")
     integrator: str = setting("euler", "integration scheme of the mass balances", choices=tuple(INTEGRATORS))
 
     def __post_init__(self) -> None:
@@ -53,65 +53,65 @@ class PlantConfig:
             named(name)
 
 
-def told(config: PlantConfig, values: Mapping[str, str]) -> PlantConfig:
-    """Change a config as the vials are told. Args: values: by keys of `TOLD`. Raises: ValueError."""
-    for key, (usual, _, change) in TOLD.items():
+def with_options(config: PlantConfig, values: Mapping[str, str]) -> PlantConfig:
+    """Return the config changed by options of the vials. Args: values: by keys of `OPTIONS`. Raises: ValueError."""
+    for key, (usual, _, change) in OPTIONS.items():
         config = change(config, values.get(key, usual))
     return config
 
 
 class LightSensor(Protocol):
-    """What is seen of light that a strain gives, N vials. draws: what was drawn once; strain: its number."""
+    """Interface of N sensors of one strain's light. draws: constants drawn once, by name; strain: its index."""
 
     draws: dict[str, Array]
     strain: int
 
     def reset(self, producers: Array, growth: Array, temperature: Array) -> None:
-        """Start anew. Args: producers: OD of the strain; growth: its rate, 1/min; temperature: degC."""
+        """Start a new culture. Args: producers: OD of the strain; growth: its rate, 1/min; temperature: degC."""
 
     def new_minute(self, temperature: Array) -> None:
-        """Begin a minute at a temperature, degC."""
+        """Begin a new minute at a temperature, degC."""
 
     def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
-        """Pass an interval, min.
+        """Advance by an interval, min.
 
-        Args: producers: mean OD of the strain. kept: share that a dose at its start leaves; dilution: 1/min, during it;
-          concentrated: by evaporation, at its end.
+        Args: producers: mean OD of the strain. kept: fraction left by a dose at the start; dilution: dilution rate,
+          1/min; concentrated: factor of the concentrations by evaporation, applied at the end.
         """
 
     def read(self, od: Array, minutes: float) -> Array:
-        """Take one reading, counts. Args: od: of all cells; minutes: since reset."""
+        """Take one reading, counts. Args: od: total OD of all cells; minutes: time since reset."""
 
 
 STRAINS: list[Callable[[PlantConfig, Streams], tuple[Sequence[Strain], dict[str, Array]]]] = []
-"""From the config and a stream per vial, further strains and what was drawn of them; a guest adds its own."""
-TOLD: dict[str, tuple[str, str, Callable[[PlantConfig, str], PlantConfig]]] = {}
-"""What vials are told beside their preset: key -> usual value, meaning, what it makes of the config; of guests."""
+"""Functions (config, a stream per vial) -> further strains and their random constants by name. Guests add entries."""
+OPTIONS: dict[str, tuple[str, str, Callable[[PlantConfig, str], PlantConfig]]] = {}
+"""Options of simulated vials: key -> default, meaning, function (config, value) -> config. Guests add entries."""
 LIGHTS: list[Callable[[PlantConfig, Streams], LightSensor | None]] = []
-"""From the config and a stream per vial, the sensor of a strain's light, if there is one; a guest adds its own."""
+"""Functions (config, a stream per vial) -> sensor of a strain's light, or None. Guests add entries."""
 
 
 class Plant:
-    """N vials, advanced together: parts `culture`, `vessel`, `thermal`, `feed` (the pump), `sensor`, `fluorescence`.
+    """N vials, advanced together. Parts: `culture`, `vessel`, `thermal`, `feed` (the pump), `sensor`, `fluorescence`.
 
-    With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and the dilution
-    rate is 0 after it; F = exp(-v/V) for a volume v exchanged at constant volume, V/(V + v) for a volume that stays in
-    the vial. Source of the terms and numbers: docs/biology.md.
+    With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F. The dilution rate
+    is 0 after the dose. F = exp(-v/V) for a volume v exchanged at constant volume V; F = V/(V + v) for a volume v that
+    stays in the vial. Source of the terms and numbers: docs/biology.md.
 
-    Constants of a reactor (growth rate, pump flow, optics, tube height) are drawn here, recorded in `draws`, and
-    survive `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and
+    Constants of a reactor (growth rate, pump flow, optics, tube height) are drawn once and recorded in `draws`. They
+    survive `reset`, which starts a new culture in the same reactor. Process noise is drawn per minute of plant time and
     sensor noise per reading, from one stream per vial. Neither depends on the pump commands, and vial i is the same for
     every N.
 
     Args:
-      config: its settings.
+      config: settings of the plant.
       n: number of vials.
       rng: a generator, from which one stream per vial is spawned, or a sequence of n generators.
-      volume_ml: volume of the bench, mL, (N,) or one for all; the config may override it.
-    Raises: ValueError for n < 1 or a sequence of another length.
+      volume_ml: culture volume of the bench, mL, (N,) or one for all; the config may override it.
+    Raises: ValueError for n < 1 or a sequence whose length is not n.
 
-    State and fault switches are arrays of shape (N,) in the parts. A switch may be set at any time and stays until it
-    is set again. `minutes` is the time since reset.
+    State and fault switches are arrays of shape (N,) in the parts. A switch may be set at any time and keeps its value
+    until it is set again. `minutes` is the time since reset.
     """
 
     def __init__(
@@ -156,14 +156,13 @@ class Plant:
         temperature: Array | float | None = None,
         share: Array | float | None = None,
     ) -> None:
-        """Start a new culture at the waste tube's level, in balance with its medium.
+        """Start a new culture, filled up to the waste tube. Fault switches, bottle content and `draws` are kept.
 
         Args:
-          od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
-          temperature: of vial and thermostat, degC, as `od`; None = `start_temperature` of the config.
-          share: of the second strain, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
-        Fault switches, bottle content and drawn parameters stay. Raises: ValueError for an OD below
-        0 or a share outside 0 to 1.
+          od: suspended biomass, OD, scalar or shape (N,), >= 0; None: `start_od` of the config.
+          temperature: temperature of vial and thermostat, degC, scalar or (N,); None: `start_temperature`.
+          share: share of the second strain, if there is one, scalar or shape (N,), 0 to 1; None: as drawn.
+        Raises: ValueError for an OD below 0 or a share outside 0 to 1.
         """
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)
         if not np.all(start >= 0.0):
@@ -191,18 +190,18 @@ class Plant:
         overflow_s: Array | float = 0.0,
         supply_ml: Array | float = 0.0,
     ) -> None:
-        """Run pumps, growth and heater for an interval of any length; long ones are cut into minutes.
+        """Run pumps, growth and heater for an interval of any length, which is cut into minutes.
 
         Args:
           minutes: length of the interval, min, > 0.
           feed_s: on-time of the feed pump at full power, s, shape (N,) or scalar. Negative: the pump runs backwards and
-          removes culture. An on-time of the whole interval continues the pulse into the next call.
-          waste_s: on-time of the waste pump, s, same shape, beside the feed; None: as much as needed. Negative blows
-          air without effect.
-          temperature_target: thermostat, degC, scalar or shape (N,); None or nan: unchanged, 0: off.
+          removes culture. If the on-time fills the interval, the pulse continues in the next call.
+          waste_s: on-time of the waste pump during the feed, s, same shape; None: as long as needed. Negative: no
+          effect, because the pump blows air.
+          temperature_target: target of the thermostat, degC, scalar or shape (N,); None or nan: unchanged, 0: off.
           overflow_s: on-time of the overflow pump, s, as `waste_s`; 0: none.
-          supply_ml: another fluid without cells by a spare pump, mL, shape (N,) or scalar, with the feed.
-        Raises: ValueError for an interval not positive or an on-time not finite.
+          supply_ml: volume of a fluid without cells that a spare pump adds with the feed, mL, shape (N,) or scalar.
+        Raises: ValueError if the interval is not positive or an on-time is not finite.
         """
         if not (minutes > 0.0 and np.isfinite(minutes)):
             raise ValueError(f"interval = {minutes} min: allowed > 0")
@@ -225,7 +224,7 @@ class Plant:
     def _advance_piece(
         self, minutes: float, feed_s: Array, waste_s: Array, overflow_s: Array, supply_ml: Array
     ) -> None:
-        """Advance at most one minute: draws, doses, heat, growth, evaporation."""
+        """Advance by at most one minute: random draws, doses, heat, growth, evaporation."""
         self._draw_minutes()
         volume = self.vessel.volume_ml
         fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.age_min) + supply_ml
@@ -249,7 +248,7 @@ class Plant:
         self.minutes += minutes
 
     def _draw_minutes(self) -> None:
-        """Take the draws of every minute since the last call."""
+        """Take the random draws of every minute that began since the last call; apply the disturbances."""
         while self._minute < int(np.floor(self.minutes + 1e-6)):
             (z_pump, z_mu, z_ripple), (u_timing, u_prime) = self._tape.next()
             self.feed.new_minute(z_pump, u_timing, u_prime)
@@ -262,10 +261,10 @@ class Plant:
             self._minute += 1
 
     def expected_od(self, minutes: float, feed_s: Array) -> Array:
-        """Return the expected suspended biomass after an interval, OD, (A, N); without side effects.
+        """Return the expected suspended biomass after an interval, OD, (A, N); no side effects.
 
-        Each strain grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is
-        diluted by the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
+        Each strain grows at its present rate (present substrate, temperature, drift and stirring) and is diluted by the
+        mean dose of a primed pump. Random draws of the interval, priming and wall growth are neglected.
 
         Args:
           minutes: length of the interval, min, at most 1.
@@ -282,7 +281,7 @@ class Plant:
     def at_rest(self, minutes: float, feed_s: Array | float) -> tuple[Array, Array]:
         """Compute the decrease of ln x by one mean dose of `feed_s` s, and the growth share, each (N,).
 
-        Args: minutes: between two doses. Conditions as in `expected_od`.
+        Args: minutes: time between two doses, min. Assumptions as in `expected_od`.
         """
         rate, biomass = self.culture.rates(self.age_min), self.culture.biomass
         taken = self.feed.expected(np.broadcast_to(feed_s, (self.n,)), self.age_min) / self.vessel.volume_ml
@@ -291,7 +290,7 @@ class Plant:
 
     @property
     def age_min(self) -> Array:
-        """Age of culture and pump, `start_min` and the time since reset, min, shape (N,)."""
+        """Age of culture and pump: `start_min` plus the time since reset, min, shape (N,)."""
         return self.draws["start_min"] + self.minutes
 
     def read_od(self) -> Array:
@@ -300,11 +299,11 @@ class Plant:
 
     @property
     def apparent_od(self) -> Array:
-        """Return the reading of a noise-free sensor, OD, shape (N,)."""
+        """Reading of a noise-free sensor, OD, shape (N,)."""
         return self.sensor.apparent(self.culture.in_light_path, self.culture.wall, self.minutes)
 
     def read_fluorescence(self) -> Array:
-        """One reading of every fluorescence sensor, counts, shape (N,); nan where nothing gives light."""
+        """Take one reading of every fluorescence sensor, counts, shape (N,); nan if no strain emits light."""
         if self.fluorescence is None:
             return np.full(self.n, np.nan)
         return np.asarray(self.fluorescence.read(self.culture.od, self.minutes))

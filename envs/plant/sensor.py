@@ -1,4 +1,4 @@
-"""The optical-density sensor of one vial: optics, noise, outliers, bubbles, drift and freezing."""
+"""Optical-density sensors of the vials: optics, noise, outliers, bubbles, drift and freezing."""
 
 from dataclasses import dataclass
 
@@ -16,31 +16,31 @@ FULL_SCALE = 65535.0  # counts of the 16-bit converter
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Errors of the averaged reading of one minute; the defaults are a perfect sensor."""
+    """Errors of a reading, the average of one minute; the defaults are a perfect sensor."""
 
     noise_floor: float = setting(
         0.0, "sd of a reading = hypot(noise_floor, noise_relative * OD)", "OD", within=(0, 0.1)
     )
-    noise_relative: float = setting(0.0, "see noise_floor", within=(0, 0.1))
+    noise_relative: float = setting(0.0, "relative noise; see noise_floor", within=(0, 0.1))
     noise_factor_sd: float = setting(0.0, "sd of the logarithm of a reactor's noise factor (median 1)", within=(0, 1))
     noise_swing_sd: float = setting(
-        0.0, "sd of the logarithm of the slow factor (median 1) of a reactor's noise", within=(0, 1)
+        0.0, "sd of the logarithm of a slowly varying noise factor (median 1)", within=(0, 1)
     )
     noise_swing_min: float = setting(
         180.0, "correlation time of that factor, with a reading each minute", "min", within=(1, 10_000)
     )
     lag1: float = setting(0.0, "correlation of the noise of successive readings", within=(0, 0.95))
     gain_cv: float = setting(0.0, "spread between reactors of the slope k in y = k (x + c x^2)", within=(0, 0.3))
-    curvature: float = setting(0.0, "limit of c, which is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
-    blank_error: float = setting(0.0, "largest offset, drawn uniformly in +- this", "OD", within=(0, 0.2))
+    curvature: float = setting(0.0, "c is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
+    blank_error: float = setting(0.0, "the offset is drawn uniformly within +- this", "OD", within=(0, 0.2))
     drift_per_h: float = setting(0.0, "drift of the offset", "OD/h", within=(-0.05, 0.05))
     shift_od: float = setting(0.0, "step of the offset at `shift_min`", "OD", within=(-0.2, 0.2))
     shift_min: float = setting(0.0, "age of the blank at the step", "min", at_least=0.0)
-    wall_gain: float = setting(0.0, "OD seen per OD-equivalent on the wall", within=(0, 1))
-    outlier_rate: float = setting(0.0, "probability of a jump of more than 0.04, 54 % upward", within=(0, 0.2))
-    bubble_rate: float = setting(0.0, "probability of a bubble: 0.05 to 0.3 more for 1 to 5 readings", within=(0, 0.2))
-    zero_rate: float = setting(0.0, "probability of an exact zero", within=(0, 0.2))
-    freeze_rate: float = setting(0.0, "probability that the next 5 to 30 readings repeat", within=(0, 0.2))
+    wall_gain: float = setting(0.0, "rise of the reading per OD-equivalent on the wall", within=(0, 1))
+    outlier_rate: float = setting(0.0, "probability of an outlier of 0.04 OD or more, 54 % upward", within=(0, 0.2))
+    bubble_rate: float = setting(0.0, "probability of a bubble: +0.05 to 0.3 OD for 1 to 5 readings", within=(0, 0.2))
+    zero_rate: float = setting(0.0, "probability that a reading is exactly 0", within=(0, 0.2))
+    freeze_rate: float = setting(0.0, "probability that the next 5 to 30 readings are equal", within=(0, 0.2))
     quantised: bool = setting(False, "round to whole counts of the 16-bit converter")
     blank_counts: float = setting(
         14000.0, "mean counts of clear medium, 10 to 25 thousand in public logs", "counts", within=(3000, 60000)
@@ -52,7 +52,7 @@ class SensorConfig:
 
 
 def density(od: Array | float) -> Array:
-    """Return R of LINEAR R + QUADRATIC R^2 = OD; negative below the blank, limited if no root exists."""
+    """Solve LINEAR R + QUADRATIC R^2 = OD for R; R < 0 for OD < 0. Without a root, return the smallest R."""
     half = LINEAR / (2.0 * QUADRATIC)
     return np.asarray(np.sqrt(np.maximum(np.asarray(od) / QUADRATIC + half * half, 0.0)) - half)
 
@@ -61,24 +61,24 @@ def counts_from_od(od: Array, blank: Array | float) -> Array:
     """Return raw counts by the device's inverted OD formula; not rounded, >= 1 (docs/device.md, OD measurement).
 
     Args:
-      od: device OD; blank: count of clear medium; broadcastable.
+      od: OD by the device's formula; blank: counts of clear medium; both broadcastable.
     """
     return np.clip(blank * 10.0 ** -density(od), 1.0, FULL_SCALE)
 
 
 def od_from_counts(raw: Array, blank: Array | float) -> Array:
-    """Convert counts by the device's own formula, OD = 1.833 R + 0.226 R^2 with R = log10(blank / raw), raw > 0."""
+    """Convert counts to OD by the device's formula, OD = 1.833 R + 0.226 R^2 with R = log10(blank / raw), raw > 0."""
     ratio = np.log10(blank / raw)
     return np.asarray(LINEAR * ratio + QUADRATIC * ratio * ratio)
 
 
 class OdSensor:
-    """N sensors. y = k (x + c x^2) + wall_gain w + offset + drift t, then noise and misreadings.
+    """OD sensors of N vials: y = k (x + c x^2) + wall_gain w + offset + drift t, then noise and misreadings.
 
     Args:
-      config: their errors.
+      config: errors of the readings.
       rngs: one stream per vial for its constants (slope, curvature, offset, noise factor, blank).
-      noise_rngs: one stream per vial for the readings; a reading draws one row, always of the same length.
+      noise_rngs: one stream per vial for its readings; each reading draws the same number of values.
     `frozen` (bool) and `extra_offset` (OD), shape (N,), are fault switches that may be set at any time.
     """
 
@@ -99,7 +99,7 @@ class OdSensor:
         self.reset()
 
     def reset(self) -> None:
-        """Forget past readings: no bubble, no frozen reading, no correlated noise."""
+        """Clear the effects of past readings: bubbles, frozen readings, correlated noise."""
         n = self.frozen.size
         self._noise, self._swing = np.zeros(n), self.draws["sensor_noise_swing"]
         self._bubble, self._bubble_left, self._freeze_left = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -119,7 +119,7 @@ class OdSensor:
         return np.asarray(optical + self.config.wall_gain * wall + offset)
 
     def read(self, od: Array, wall: Array, minutes: float) -> Array:
-        """Take one averaged reading with all errors; arguments as `apparent`, OD, shape (N,)."""
+        """Take one averaged reading with all errors, OD, shape (N,). Args: as in `apparent`."""
         c = self.config
         (z, *swing), u = self._tape.next()
         clean = self.apparent(od, wall, minutes)
@@ -141,7 +141,7 @@ class OdSensor:
         return self._last.copy()
 
     def _misreading(self, u: Array) -> Array:
-        """Draw isolated outliers and bubbles of this reading, OD, shape (N,)."""
+        """Draw the error of this reading by outliers and bubbles, OD, shape (N,)."""
         c = self.config
         # jumps start at 0.04 (the threshold of their count), with an exponential tail of 0.05 OD
         jump = (0.04 - 0.05 * np.log1p(-u[1])) * np.where(u[2] < 0.54, 1.0, -1.0)

@@ -1,4 +1,4 @@
-"""What tells the strains in a vial apart: growth rate, how it follows temperature, and how much each begins with."""
+"""Properties of the strains in a vial: growth rate, its temperature dependence, and the share at the start."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 
-REFERENCE_TEMPERATURE = 37.0  # degC, at which every rate is given
+REFERENCE_TEMPERATURE = 37.0  # degC; every growth rate is given at this temperature
 GAS_CONSTANT = 8.314462618e-3  # kJ/(mol K)
 
 
 def arrhenius(activation_kj_mol: float) -> Curve:
-    """phi(T) = exp(-Ea / (R (T + 273.15))), valid 21 to 37 degC for E. coli (Ingraham & Marr, BioNumbers 105003).
+    """Return phi(T) = exp(-Ea / (R (T + 273.15))), for E. coli from 21 to 37 degC (Ingraham & Marr, BioNumbers 105003).
 
-    Args: activation_kj_mol: Ea; 54 to 59 in the literature, mu(30)/mu(37) = 0.59 to 0.62.
+    Args: activation_kj_mol: Ea; 54 to 59 in the literature, which gives mu(30)/mu(37) = 0.59 to 0.62.
     """
     return lambda temperature: np.exp(-activation_kj_mol / (GAS_CONSTANT * (temperature + 273.15)))
 
 
 def cardinal(t_min: float = 6.0, t_opt: float = 41.0, t_max: float = 47.2) -> Curve:
-    """Cardinal temperature model with inflexion (Rosso 1993): 1 at t_opt, 0 outside [t_min, t_max], degC.
+    """Return the cardinal temperature model with inflexion (Rosso 1993): 1 at t_opt, 0 outside t_min..t_max, degC.
 
     phi(T) = (T - t_max)(T - t_min)^2
              / {(t_opt - t_min)[(t_opt - t_min)(T - t_opt) - (t_opt - t_max)(t_opt + t_min - 2 T)]}
@@ -44,17 +44,17 @@ LAWS: dict[str, Callable[[Any, float, int], Curve]] = {
     "cardinal": lambda plant, activation, number: cardinal(),
 }
 TEMPERATURE_LAWS = list(LAWS)
-"""Their names."""
+"""Names of the temperature laws."""
 
 
 def add_law(name: str, make: Callable[[Any, float, int], Curve]) -> None:
-    """Make a law known. Args: make: from plant's config, activation energy in kJ/mol and strain's number."""
+    """Register a temperature law. Args: make: (plant's config, activation energy in kJ/mol, strain's index) -> phi."""
     LAWS[name] = make
     TEMPERATURE_LAWS.append(name)
 
 
 def response(law: str, plant: Any, activation_kj_mol: float, number: int) -> Curve:
-    """phi(T) / phi(37 degC) of a temperature law, one of `TEMPERATURE_LAWS`; the others as of `add_law`."""
+    """Return phi(T) / phi(37 degC) of a law of `TEMPERATURE_LAWS`; the other arguments are those of `make`."""
     phi = LAWS[law](plant, activation_kj_mol, number)
     reference = phi(np.asarray(REFERENCE_TEMPERATURE))
     return lambda temperature: phi(temperature) / reference
@@ -62,10 +62,10 @@ def response(law: str, plant: Any, activation_kj_mol: float, number: int) -> Cur
 
 @dataclass(frozen=True, eq=False)
 class Strain:
-    """One strain of N vials.
+    """One strain in N vials.
 
-    mu: specific growth rate in fresh medium at 37 degC, 1/min, (N,). phi: how that follows temperature. lag_min: with
-    which time constant. share: of the OD at reset, (N,); that of the first strain is what the others leave.
+    mu: specific growth rate in fresh medium at 37 degC, 1/min, (N,). phi: temperature -> mu relative to 37 degC.
+    lag_min: time constant of phi, min. share: share of the OD at reset, (N,); the first strain gets the rest instead.
     """
 
     mu: Array

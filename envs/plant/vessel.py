@@ -1,4 +1,4 @@
-"""The vial as a vessel: inflow, outflow, level, evaporation."""
+"""Liquid in the vial: inflow, outflow, level, evaporation."""
 
 import math
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from envs.plant.pump import PumpConfig
 
 Mask = NDArray[np.bool_]
 
-MIN_VOLUME_ML = 1.0  # mL that no pump can remove; keeps concentrations finite
+MIN_VOLUME_ML = 1.0  # mL; no pump can remove it, so concentrations stay finite
 
 
 @dataclass(frozen=True)
 class VesselConfig:
-    """The vial and its bottle."""
+    """Settings of the vial and its bottle of fresh medium."""
 
     volume_ml: float | None = setting(
-        None, "mean culture volume up to the waste tube, if it should differ from the bench's", "mL", within=(5, 50)
+        None, "mean culture volume up to the waste tube; null: that of the bench", "mL", within=(5, 50)
     )
     volume_sd_ml: float = setting(0.0, "sd of that volume between vials", "mL", within=(0, 1.5))
     overflow_above_ml: float = setting(
@@ -45,9 +45,9 @@ class VesselConfig:
         require(enough, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
 
     def of(self, bench_ml: Array) -> Array:
-        """Return the mean culture volume of each vial, mL, (N,); `bench_ml` unless the config sets it.
+        """Return the mean culture volume of each vial, mL, (N,): `volume_ml` of the config, else `bench_ml`.
 
-        Raises: ValueError for more than the capacity.
+        Raises: ValueError if a vial's capacity is too small.
         """
         mean = bench_ml if self.volume_ml is None else np.full(len(bench_ml), self.volume_ml)
         self._holds(float(mean.max()))
@@ -57,12 +57,12 @@ class VesselConfig:
 class Vessel:
     """N vials with outlets at fixed heights.
 
-    The waste pump lowers the level to its tube, never below. The rest raises the level up to the rim, where
-    `overflowed` is set. An overflow pump is a second such outlet a little higher.
+    The waste pump lowers the level down to its tube. Liquid that it does not remove raises the level; above the
+    capacity, `overflowed` is set. The overflow pump is a second outlet, a little higher.
 
     Args:
       config: heights and evaporation; pump: flows of the waste pump and of the overflow pump.
-      rngs: one stream per vial, for the height of its tube. bench_ml: volume of the bench, mL, (N,).
+      rngs: one stream per vial, for the height of its tube. bench_ml: culture volume of the bench, mL, (N,).
     State, shape (N,): `volume_ml`, `overflowed`. Fault switches, shape (N,): `waste_gain_factor` and
     `overflow_gain_factor`, 0 blocked, 1 normal.
     """
@@ -83,13 +83,11 @@ class Vessel:
         self.overflowed: Mask = np.zeros(self._tube_ml.size, dtype=bool)
 
     def exchange(self, fresh: Array, waste_s: Array, overflow_s: Array) -> Array:
-        """Move liquid; return the factor F of the concentrations of the old content, shape (N,).
+        """Add fresh medium and run the outlets; return the factor F of the old content's concentrations, shape (N,).
 
-        Fresh medium fills the vial up to an outlet's tube, replaces there the volume that its pump removes, then rises
-        on.
-
-        Args:
-          fresh: fresh medium, mL, shape (N,). waste_s, overflow_s: on-times of the two pumps, s, shape (N,).
+        Fresh medium first fills the vial up to the tube of an outlet. There it replaces the volume that the outlet's
+        pump removes. The rest raises the level further.
+        Args: fresh: fresh medium, mL, shape (N,). waste_s, overflow_s: on-times of the two pumps, s, shape (N,).
         """
         above_ml = self._tube_ml + self.config.overflow_above_ml
         outlets = [  # from below: level of the tube, volume that the pump can move in mL
@@ -112,7 +110,7 @@ class Vessel:
         return np.asarray(kept)
 
     def draw_out(self, volume_ml: Array) -> None:
-        """Remove culture from below, mL, shape (N,)."""
+        """Remove a volume of culture, mL, shape (N,), also below the waste tube."""
         self.volume_ml = np.maximum(self.volume_ml - volume_ml, MIN_VOLUME_ML)
 
     def evaporate(self, minutes: float) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from envs.bench import Bench
-from envs.plant.plant import TOLD, PlantConfig, told
+from envs.plant.plant import OPTIONS, PlantConfig, with_options
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.family import ChiBioFamily, Link, linked
 from hardware.clock import VirtualClock
@@ -30,7 +30,7 @@ def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
 
 
 def _told(backend: EmulatorConfig) -> dict[str, str]:
-    return {key: getattr(backend, key, usual) for key, (usual, _, _) in TOLD.items()}
+    return {key: getattr(backend, key, usual) for key, (usual, _, _) in OPTIONS.items()}
 
 
 class EmulatorFamily(ChiBioFamily):
@@ -60,7 +60,7 @@ class EmulatorFamily(ChiBioFamily):
         return replace(backend, plant=plant, **values)
 
     def vials(self, backend: EmulatorConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
-        return "backend.plant", told(plant_preset(backend.plant), _told(backend))
+        return "backend.plant", with_options(plant_preset(backend.plant), _told(backend))
 
     def address(self, backend: ChiBioConfig) -> str:
         return "in this computer"

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from conf.presets import groups
-from envs.plant.plant import TOLD, told
+from envs.plant.plant import OPTIONS, with_options
 from hardware.clock import Clock, DeviceClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
@@ -217,7 +217,7 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
     add("--volume", default="20", help="culture, mL, one for all or one per reactor (default %(default)s)")
-    for key, (usual, what, _) in TOLD.items():
+    for key, (usual, what, _) in OPTIONS.items():
         add(f"--{key}", default=usual, help=f"{what} (default %(default)s)")
     add("--until-eof", action="store_true", help="end when standard input ends: with the process that holds it")
     add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
@@ -256,7 +256,7 @@ def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDe
         overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
         pump3_ml_s=arguments.pump3_flow, pump4_ml_s=arguments.pump4_flow,
     )  # fmt: skip
-    plant = told(plant_preset(arguments.plant), vars(arguments))
+    plant = with_options(plant_preset(arguments.plant), vars(arguments))
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
