@@ -1,4 +1,4 @@
-"""What has to happen at its time: a queue of small tasks on a clock, run by one thread."""
+"""Timed tasks: a queue of small tasks on a clock, run by one thread."""
 
 import heapq
 import itertools
@@ -7,7 +7,7 @@ from collections.abc import Generator
 from hardware.clock import Clock
 
 Task = Generator[float, None, None]
-"""A generator that does its work in steps; what it yields is the pause in seconds until its next step."""
+"""A generator that works in steps; it yields the pause until its next step, s."""
 
 
 class Agenda:
@@ -26,7 +26,7 @@ class Agenda:
         heapq.heappush(self._queue, (self._clock.now() + delay_s, next(self._order), task))
 
     def run_due(self, until: float | None = None) -> None:
-        """Run every step that is due at clock time `until`, by default now; what becomes due meanwhile waits.
+        """Run every step that is due at clock time `until`, by default now; steps that become due meanwhile wait.
 
         Raises: what a step raises; call again with the same `until` for the rest.
         """
@@ -38,7 +38,7 @@ class Agenda:
                 self.add(task, pause)
 
     def next_due(self) -> float:
-        """Clock time of the next step, inf if there is none."""
+        """Return the clock time of the next step, inf if there is none."""
         return self._queue[0][0] if self._queue else float("inf")
 
     def clear(self) -> None:

@@ -1,4 +1,4 @@
-"""What was measured of each reactor on the bench, as files: one of YAML per reactor and part, REACTOR_PART.yaml."""
+"""Bench calibrations of the reactors as YAML files, one per reactor and part: REACTOR_PART.yaml."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
-    """Pumps and blanks of reactors; what was never measured is nominal, and its blank nan. Raises: UnfitError."""
+    """Load pump calibrations and blanks; without a file a pump is nominal and a blank nan. Raises: UnfitError."""
     calibrations = []
     for name in reactors:
         feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)

@@ -31,7 +31,7 @@ class ChiBioConfig:
     fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "fluorescence measurement")
     stale_s: float = setting(100.0, "age at which the newest sample is too old for a dose", "s", within=(65, 600))
     lost_s: float = setting(
-        180.0, "age at which a dead experiment thread is restarted; more than stale_s", "s", within=(100, 3600)
+        180.0, "age of the newest sample at which the experiment is restarted; above stale_s", "s", within=(100, 3600)
     )
     poll_s: float = setting(2.0, "time between two requests for an expected sample", "s", within=(0.2, 10))
     window_s: float = setting(
@@ -49,7 +49,7 @@ class ChiBioConfig:
         "silence after which the board agent, if present, switches the pumps off: its --deadman",
         "s",
         within=(20, 3600),
-        note="what a dose may have repeated until then is booked",
+        note="the repetitions of a dose until then are booked",
     )
     recover: bool = setting(True, "restore and restart a device that lost its memory or whose thread died")
 
@@ -70,7 +70,7 @@ class ChiBioConfig:
 
 @dataclass(frozen=True)
 class EmulatorConfig(ChiBioConfig):
-    """`backend=emulator`: the same driver against an emulator that the run starts by itself; `url` is then ignored."""
+    """`backend=emulator`: the same driver with an emulator that the run starts; `url` is ignored."""
 
     kind: str = setting("emulator", "backend")
     speed: float = setting(

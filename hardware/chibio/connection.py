@@ -11,17 +11,17 @@ from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, no_log
 
 SEEN_S = 1.0
-"""For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
-Later the next command looks first, because a server that starts carries out what it was sent meanwhile, even to a
-reactor that is absent by then."""
+"""Time after an answer for which a reactor counts as present: a server that ended needs longer to listen again. After
+this time the next command is preceded by a read, because a starting server carries out commands sent meanwhile, even
+to a reactor that has become absent."""
 SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
 DRAIN = 0.25
-"""Duty of a waste pump that runs beside a feed pump which may run: what the app clears its tube with."""
+"""Duty of the waste pump while a feed pump may run; the device's software clears the waste tube with this duty."""
 
 
 def identity(transport: Transport, clock: Clock, where: str) -> str:
-    """Identity of the first reactor that is present, by whatever link (`where`). Raises: as `Connection.read`."""
+    """Read the identity of the first present reactor. Args: where: the link, for errors. Raises: `Connection.read`."""
     reply = transport.get("/getSysdata/")
     if reply.status != 200:
         raise messages.WrongStatus(request=f"{where}: GET /getSysdata/", status=reply.status, expected=200)
@@ -34,20 +34,20 @@ def identity(transport: Transport, clock: Clock, where: str) -> str:
 class Connection:
     """The verified conversation with one reactor.
 
-    The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
-    the answer names this reactor and its pinned identity (docs/device.md, Selection). A command is sent only if the
-    last verified read saw this reactor present: one request to an absent one ends the whole server (docs/device.md,
-    Failures). After a request without an answer, or `SEEN_S` without a request, the next command looks first.
+    The device shows one selected reactor to all clients. A read is therefore changeDevice plus GET, valid only if the
+    answer names this reactor and its pinned identity (docs/device.md, Selection). A command is sent only if the last
+    verified read saw this reactor present, because a request to an absent one ends the whole server (docs/device.md,
+    Failures). After a request without an answer, or `SEEN_S` without a request, a read precedes the next command.
 
     Args:
-      name: position, M0 to M7. permitted: what this client may send.
+      name: position, M0 to M7. permitted: commands that this client may send.
       log: takes every command and its answer.
     """
 
     def __init__(self, name: str, permitted: Permitted, transport: Transport, clock: Clock, log: Log) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
-        self.state: DeviceState | None = None  # the last verified one
+        self.state: DeviceState | None = None  # the last verified state
         self.took_s = 0.0  # how long the last verified read took
         self._unsure = False  # a request was not answered as expected since presence was last seen
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
@@ -57,15 +57,15 @@ class Connection:
 
     @property
     def heard_s(self) -> float:
-        """Clock time of the newest answer over this link, to whichever reactor's request."""
+        """Clock time of the newest answer over this link, to a request about any reactor."""
         return self._transport.heard_s
 
     def switched_off(self) -> Mapping[str, float]:
-        """Pump, how many s ago a dead-man switch on the way found it on and switched it off. Raises: as `read`."""
+        """Return the pumps that a dead-man switch on the link switched off, and how many s ago. Raises: as `read`."""
         return self._transport.switched_off().get(self.name, {})
 
     def read(self, tries: int = 3) -> DeviceState:
-        """Read the reactor's state, certainly its own.
+        """Read the reactor's state; verify that it belongs to this reactor.
 
         Raises: LinkError, ProtocolError; DeviceStateError if it is absent or another client keeps selecting reactors;
           IdentityError if another unit answers at this position than before.
@@ -79,7 +79,7 @@ class Connection:
                 break
         if state.selected != self.name:
             raise messages.CannotBeRead(reactor=self.name, shown=state.selected)
-        if not ours:  # nor the times before: one answer may be garbled on its way
+        if not ours:  # in no try, so this is not one garbled answer
             self.state = None
             found, pinned = state.device_id or "none", self.device_id or "none"
             raise messages.OtherIdentity(reactor=self.name, found=found, pinned=pinned)
@@ -88,7 +88,7 @@ class Connection:
         return state
 
     def _look(self) -> DeviceState:
-        """Read the state of the selected reactor, which tells of all whether they are present. Raises: as `read`."""
+        """Read the state of the selected reactor; it also lists the reactors that are present. Raises: as `read`."""
         before, self._unsure = self._unsure, True
         reply = self._transport.get("/getSysdata/")
         if reply.status != 200:
@@ -100,7 +100,7 @@ class Connection:
         if (
             last is not None
             and (last.selected, last.start_time) == (state.selected, state.start_time)
-            and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # else the board's clock
+            and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # not the board's clock
         ):
             raise messages.OldAnswer()
         if self.name not in state.present:
@@ -113,7 +113,7 @@ class Connection:
         """Send one command of `protocol.check_command`.
 
         Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
-          if the command is not allowed or the reactor was not present when it was last looked at.
+          if the command is not allowed or the reactor was absent at the last read.
         """
         if self.state is not None and (self._unsure or self.clock.now() - self._seen_s > SEEN_S):
             self._look()
@@ -123,7 +123,7 @@ class Connection:
         self._seen_s = self.clock.now()
 
     def toggle(self, path: str) -> DeviceState:
-        """Send a toggle of the selected reactor right after a read of this one; return the state then."""
+        """Send a toggle, which acts on the selected reactor, right after a read of this one; return the new state."""
         self.read()
         self._post(path)
         return self.read()
@@ -164,11 +164,11 @@ class Connection:
         self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
 
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """Switch these pumps off, verified; the waste pump last, which runs on while a feed pump may run.
+        """Switch these pumps off, verified; the waste pump last, and only if no feed pump may still run.
 
-        Each is tried even if another one fails, unless nothing answers. Read-back alone proves nothing, for the flags
-        are intent: with the bus hung they say off while the motor runs. So a blocking call touches the bus in between.
-        On a hung bus it outlasts the server's worker, whose end switches everything off (docs/device.md, Failures).
+        Each pump is tried even if another pump fails, unless nothing answers. The flags show commands, not motors: with
+        the bus hung they are off while the motor runs. A blocking call therefore touches the bus before the read. On a
+        hung bus this call outlasts the server's worker, whose end switches everything off (docs/device.md, Failures).
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """
         for attempt in range(tries):
@@ -216,7 +216,7 @@ class Connection:
         raise error.about(f"{', '.join(left or pumps)} not verified off")
 
     def drain(self) -> None:
-        """Waste pump on, where a feed pump may run or has run without it. Raises: as `post`."""
+        """Switch the waste pump on, because a feed pump may run or has run without it. Raises: as `post`."""
         self.target(WASTE, DRAIN)
         self.switch(WASTE, True)
 
@@ -225,7 +225,7 @@ class Connection:
         self.post(f"/MeasureTemp/IR/{self.name}")
 
     def escalate(self) -> None:
-        """End the experiment where a pump stays on, which switches everything off, then touch the bus."""
+        """End the experiment of a pump that stays on, which switches everything off, then touch the bus."""
         for path in (f"/Experiment/0/{self.name}", f"/MeasureTemp/IR/{self.name}"):
             try:
                 self.post(path)

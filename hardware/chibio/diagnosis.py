@@ -1,4 +1,4 @@
-"""What is wrong with a reactor, from what was read of it: pure functions."""
+"""Diagnosis of a reactor from its state, as pure functions."""
 
 import math
 
@@ -22,12 +22,12 @@ def diagnose(
     state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
     dosing: bool, stuck: str, ended: str, overflow_trouble: Fault | None,
 ) -> Fault | None:  # fmt: skip
-    """Find the gravest fault that a verified state shows, against how the reactor should be found.
+    """Find the most serious fault that a verified state shows; None if the reactor is as the run expects.
 
-    Args: age_s: of the newest sample, s. start_time: of its experiment. blank: counts. setpoint: OD at which it was
-      handed over to the on-board regulation, nan if this program controls. dosing: its pumps may be on. stuck: why its
-      pumps could not be verified off, ended: why this program ended its experiment, "" if not. overflow_trouble: of its
-      overflow pump.
+    Args: age_s: age of the newest sample, s. start_time: start of the run's experiment. blank: the run's blank, counts.
+      setpoint: OD of the hand-over to the on-board regulation, nan if this program controls. dosing: pumps may be on.
+      stuck: why the pumps could not be verified off, or "". ended: why this program ended the experiment, or "".
+      overflow_trouble: fault of the overflow pump.
     """
     if state.start_time != start_time or not state.started:
         return messages.ExperimentGone(start_time=start_time, cycles=state.cycles, blank=state.blank)
@@ -51,7 +51,7 @@ def diagnose(
 
 
 def fault_of(error: ReactorError, present: bool) -> Fault:
-    """Translate an error of a request or a read; `present`: the reactor was there when it was last looked at."""
+    """Translate an error of a request into a fault. Args: present: the reactor was present at the last read."""
     if isinstance(error, IdentityError):
         return messages.ReactorsExchanged(error=error)
     if not isinstance(error, DeviceStateError):

@@ -1,4 +1,4 @@
-"""One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
+"""Doses of one reactor: from intent to verified off, with carried volumes and doses that the device repeated."""
 
 import math
 from collections.abc import Callable
@@ -21,32 +21,32 @@ from hardware.logbook import Logbook
 from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
-DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
-WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
-LATE_S = 3600.0  # a tunnel may keep a command that was given up for so long, and deliver it then
-REFUSALS = 4  # of pumps that should be off, in a row, until the experiment is ended
-SLOW_S = 1.0  # an answer to a pump command that takes longer is told
+DOSE_OFF_S = 2.0  # from the end of a dose, which the device makes itself, to the off command: delays of link and bus
+WASTE_FIRST_S = 1.0  # from waste pump on to feed pump on: a motor starts 0.2 to 0.7 s after the answer
+LATE_S = 3600.0  # a tunnel may deliver a command up to this long after the client gave up on it
+REFUSALS = 4  # failed attempts in a row to switch the pumps off, until the experiment is ended
+SLOW_S = 1.0  # a slower answer to a pump command is reported
 
 
 def _change(before: float, now: float) -> Message | None:
-    """Say how a target was changed; None if it is the same, or was not known."""
+    """Return a note on a changed target; None if the target is the same, or was unknown before."""
     same = math.isnan(before) or abs(now - before) <= SAME_S / PERIOD_S
     return None if same else messages.TargetChanged(before=before, now=now)
 
 
 class DoseSequence:
-    """The doses of one reactor, one at a time, at most one per sample.
+    """The doses of one reactor: one at a time, at most one per sample.
 
-    A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
-    repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
+    A dose is planned, written to the journal, set, read back and switched on; tasks on the agenda end it. A pump that
+    is ON repeats its dose every 63 s until it is switched off, so a dose that ends late delivers more than planned.
 
-    Args: agenda: shared by all reactors; what must happen later is put on it. past: returns the reactor's
-      history by the rows of this run, those before a resume too.
-    Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
-      not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
-      volumes given beyond those booked when doses began, until the caller books and clears them; acted, the newest
-      sample a dose was decided for, None where the device's records begin anew; stray_s, clock time at which a
-      foreign dose was last seen or reported.
+    Args: agenda: shared by all reactors; holds the tasks that end a dose. past: returns the reactor's history from the
+      rows of this run, including those before a resume.
+    Attributes: running: a dose is under way: its pumps are on, or not yet verified off. stuck: why the pumps could not
+      be verified off, or "". escalated: the experiment was ended for this reason and has not started again. extra:
+      volumes given beyond those booked when doses began; the caller books and clears them. acted: key of the newest
+      sample for which a dose was decided, None if the device's records began anew. stray_s: clock time at which a pump
+      without a dose was last seen on or reported.
     """
 
     def __init__(
@@ -61,16 +61,16 @@ class DoseSequence:
         self.extra: list[Given] = []
         self.acted: tuple[float, int] | None = None
         self._due_s = math.inf  # clock time at which the dose under way should be over
-        self._given_up: dict[str, float] = {}  # pumps whose command brought no answer and may yet be carried out, since
+        self._given_up: dict[str, float] = {}  # pump: run time of an unanswered command that may still be carried out
         self.stray_s = -math.inf
-        self._strays: dict[str, tuple[Message, float, float, float]] = {}  # pumps that no dose has, as `_book_stray`
-        self._targets: dict[str, float] = {}  # of feed pumps, as last seen
-        self._quiet_s = 0.0  # run time at which no pump was on that no dose has
+        self._strays: dict[str, tuple[Message, float, float, float]] = {}  # pumps on without a dose, for `_book_stray`
+        self._targets: dict[str, float] = {}  # targets of the feed pumps, as last read
+        self._quiet_s = 0.0  # newest run time at which every pump that was on had a dose
         self._undrained = False
-        self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
+        self._doubt_s = math.nan  # run time of the last answer before a request in a dose failed, nan if none failed
 
     def restore(self) -> None:
-        """Restore the state before the resume; its pumps are to be verified off next."""
+        """Restore the state before a resume; the caller must then verify the pumps off."""
         history = self._past()
         self._quiet_s = history.seen_s
         self.acted = history.sample
@@ -79,12 +79,12 @@ class DoseSequence:
 
     @property
     def carry_ml(self) -> float:
-        """Asked for and put off to the next dose, because it is less than the pump can deliver, mL."""
+        """Requested volume kept for the next dose, because the pump cannot deliver so little, mL."""
         return self._past().carry_ml
 
     @property
     def unsettled(self) -> bool:
-        """Whether a dose is past its end and what it gave is not known yet: a sample waits for that a little."""
+        """Whether a dose should be over but its volume is still unknown; a new sample waits a short time for it."""
         return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
 
     def begin(
@@ -95,12 +95,12 @@ class DoseSequence:
         refusal: Message | None,
         pump: str = FEED,
     ) -> DosePlan:
-        """Begin the dose for `sample`; return what was, or may have been, begun. A note says why nothing was.
+        """Begin the dose for `sample`; return the dose that was, or may have been, begun. A note explains a refusal.
 
-        Args: rate: mean, mL/s. sample: its key, None if there is none. appeared_s: clock time at which it appeared,
-          -inf if unknown. refusal: why the reactor may not be dosed, None if it may. pump: that gives it; only the feed
-          carries.
-        Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
+        Args: rate: mean feed rate, mL/s. sample: key of the newest sample, or None. appeared_s: clock time at which the
+          sample appeared, -inf if unknown. refusal: reason against a dose, or None. pump: pump that gives the dose;
+          only the feed pump carries volumes over.
+        Raises: ValueError for a rate that is negative or not finite; what the journal raises.
         """
         plan = self._plan(rate, pump)
         if reason := refusal or self._obstacle(sample, appeared_s, plan.waste_s):
@@ -115,7 +115,7 @@ class DoseSequence:
         return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
 
     def _plan(self, rate: float, pump: str) -> DosePlan:
-        """Plan the dose by a pump; every pump but the feed has its declared flow and starts without a carry."""
+        """Plan the dose of a pump; a spare pump uses its configured flow and carries nothing over."""
         if pump == FEED:
             return plan_dose(rate, self.carry_ml, self._past().doses, self._calibration, self._config.dosing)
         if pump not in self._config.supply.pumps:
@@ -127,7 +127,7 @@ class DoseSequence:
         return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> Message | None:
-        """Why no dose may be given for this sample now; None if nothing stands against it."""
+        """Return why no dose may be given for this sample now; None if it may."""
         if sample is None or sample == self.acted:
             return NoNewSample()
         if self.running:
@@ -137,12 +137,12 @@ class DoseSequence:
             return messages.UnknownAge()
         if past_s + waste_s > self._config.window_s:
             return messages.SampleTooOld(past_s=past_s)
-        if past_s + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # what `_set_targets` will take
+        if past_s + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # time for `_set_targets`
             return messages.TooSlow(past_s=past_s)
         return None
 
     def _intend(self, plan: DosePlan, rate: float) -> None:
-        """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
+        """Write the dose to the journal before it begins, so that a resumed run gives no second dose for the sample."""
         doses = self._past().doses + (plan.feed_duty > 0.0)
         self._book.write(
             "intent",
@@ -153,7 +153,7 @@ class DoseSequence:
         )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
-        """Targets, read back, then on; True if the feed runs or may run. Whatever comes of it, its end is planned."""
+        """Set and read back the targets, switch on, plan the end; return whether the feed pump runs or may run."""
         self.running, fed, wasted_s = True, False, self._clock.now()
         try:
             self._set_targets(plan, appeared_s)
@@ -161,11 +161,11 @@ class DoseSequence:
             wasted_s = self._clock.now()
             self._clock.sleep(WASTE_FIRST_S)
             fed, asked_s = True, self._clock.now()
-            self._book.log("feed_on", on_s=self._book.elapsed())  # before it is done: a resumed run must know of it
+            self._book.log("feed_on", on_s=self._book.elapsed())  # before the command: a resumed run must know
             self._connection.switch(plan.pump, True)
             if self._clock.now() - asked_s > SLOW_S:
                 self._book.tell(messages.SlowLink(took_s=self._clock.now() - asked_s))
-        except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
+        except ReactorError as error:  # never repeated: the pump may run, and its end is planned below
             self._in_doubt()
             self._book.tell(messages.CommandLost(pump=plan.pump, error=error) if fed else NoDose(why=error))
         finally:
@@ -193,7 +193,7 @@ class DoseSequence:
             raise messages.TooSlow(past_s=past_s)
 
     def _feed_off(self, pump: str) -> Task:
-        """Task: feed pump off, again and again until the device has heard it."""
+        """Task: send the feed pump's off command until the device answers."""
         while self.running and self._connection.state is not None:
             try:
                 self._look_first()
@@ -207,11 +207,11 @@ class DoseSequence:
             yield self._pause_s()
 
     def _pause_s(self) -> float:
-        """Until the next attempt; nothing may be sent to a reactor that is absent or exchanged."""
+        """Return the pause until the next attempt, s; it is longer while the reactor is absent or exchanged."""
         return min(self._config.retry_s, 2.0) if self._connection.state is not None else 30.0
 
     def _finish(self) -> Task:
-        """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
+        """Task: try until all pumps are verified off, then record the end of the dose."""
         refusals = 0
         while True:
             try:
@@ -228,9 +228,9 @@ class DoseSequence:
             yield self._pause_s()
 
     def settle(self, tries: int = 1, overflow_pump: bool = False) -> None:
-        """All pumps off, verified, the overflow pump too if asked; a dose under way is on record then.
+        """Switch all pumps off, verified, the overflow pump only if requested; record the end of a dose under way.
 
-        After an answer that was missing the device is looked at first: what it shows says what became of the dose.
+        If an answer was missing, the device is read first, because its state shows what became of the dose.
         Raises: as `Connection.pumps_off`.
         """
         connection = self._connection
@@ -251,12 +251,12 @@ class DoseSequence:
         self._quiet_s = self._book.elapsed()
 
     def _in_doubt(self) -> None:
-        """Note that a request was not answered: from the last answer on the device may have done otherwise."""
+        """Note that a request was not answered: since the last answer it is unknown what the device did."""
         if math.isnan(self._doubt_s):
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """Read the pumps before they go off, after a missing answer or if the dose was open before a resume."""
+        """Read the pumps before they are switched off. Raises: an error if an answer was missing or a dose is open."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:
@@ -270,7 +270,7 @@ class DoseSequence:
         self._doubt_s = seen_s if math.isnan(seen_s) else self._book.elapsed()
 
     def watch(self, state: DeviceState, ours: bool = True) -> None:
-        """Note each feed pump that is on or has a new target without a dose. Args: ours: no one else may dose."""
+        """Note each feed pump that is on or has a new target without a dose. Args: ours: only this program may dose."""
         known, now = self._past(), self._book.elapsed()
         if not ours or state.start_time != known.start_time:
             self._targets.clear()
@@ -289,7 +289,7 @@ class DoseSequence:
             self._quiet_s = now
 
     def _look(self, state: DeviceState, seen_s: float) -> None:
-        """Record what a read shows of an open dose. Args: seen_s: of the last answer, nan if none was missing."""
+        """Record what a read shows of an open dose. Args: seen_s: run time of the last answer; nan: none is missing."""
         known, now, stopped = self._past(), self._book.elapsed(), None
         if not known.open:
             return
@@ -325,12 +325,12 @@ class DoseSequence:
             self._given_up[known.feed_pump] = known.on_s
 
     def _book_stray(self, pump: str, cause: Message, target: float, off_s: float, seen_s: float) -> None:
-        """Book what a pump gave that no dose had. Args: it was off at off_s, and seen on at seen_s, nan if never."""
+        """Book what a pump gave without a dose. Args: off_s, seen_s: run times, last seen off, and seen on (or nan)."""
         self.stray_s = self._clock.now()
         known = self._past()
         dose_s = PERIOD_S * target if target > 0.0 else 0.0
         if known.feed_pump == pump and abs(dose_s - known.feed_s) <= SAME_S:
-            seen_s = math.nan  # an old answer, delivered again, looks the same
+            seen_s = math.nan  # an old answer that arrives again looks the same
         other = replace(
             known, open=True, feed_ml=0.0, feed_s=dose_s, feed_pump=pump, on_s=off_s, fed=True, wasted=False,
             feed_on=(off_s, seen_s), feed_off=NEVER, feed_anew=NEVER,
@@ -348,7 +348,7 @@ class DoseSequence:
         self._undrained = self._undrained or (alone and bool(given))
 
     def drain(self) -> None:
-        """Waste pump on for a while, where a vial got medium without it. Raises: ReactorError."""
+        """Run the waste pump for a while if a vial got medium without it. Raises: ReactorError."""
         if not self._undrained or self.running:
             return
         self._undrained, self.running, now_s = False, True, self._book.elapsed()

@@ -36,7 +36,7 @@ class PumpCalibration:
         check(self, "pump calibration")
 
     def on_time(self, volume_ml: float) -> float:
-        """Seconds to ask for so that `volume_ml` flows; not below 0."""
+        """Return the on-time that delivers `volume_ml`, s; not below 0."""
         return max(volume_ml / self.flow_ml_s - self.bias_s, 0.0)
 
     def volume(self, on_s: float) -> float:
@@ -49,17 +49,17 @@ class PumpCalibration:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Invert `asdict`; further keys, as of the weighings, are ignored. Raises: ValueError naming key and range."""
+        """Invert `asdict`; ignore other keys, such as the weighings. Raises: ValueError naming key and range."""
         known = {f.name: values[f.name] for f in fields(cls) if f.name in values}
-        texts = {key: str(known[key]) for key in ("date", "device_id") if key in known}  # YAML makes a date of a date
+        texts = {key: str(known[key]) for key in ("date", "device_id") if key in known}  # YAML parses a date
         return build(cls(), known | texts, "pump calibration")
 
 
 @dataclass(frozen=True)
 class ReactorCalibration:
-    """What was measured of one reactor on the bench: its two pumps and its blank.
+    """Bench calibration of one reactor: its two pumps and its blank.
 
-    blank: raw counts of clear medium under run conditions; nan = take what the device holds.
+    blank: raw counts of clear medium under run conditions; nan: use the device's blank.
     """
 
     feed: PumpCalibration = PumpCalibration()
@@ -73,16 +73,16 @@ class ReactorCalibration:
 
 @dataclass(frozen=True)
 class DosingConfig:
-    """How a feed rate becomes a dose of feed and a dose of waste.
+    """Conversion of a feed rate into a dose of feed and a dose of waste.
 
-    The waste runs for factor * feed + extra at least. The device's own law is 4 and 4.4 s; the level is set by the
-    height of the waste tube, so too much does no harm.
+    The waste pump runs for at least waste_factor * feed time + waste_extra_s; the device itself uses 4 and 4.4 s. A
+    longer time does no harm, because the height of the waste tube sets the level.
     """
 
     waste_factor: float = setting(4.0, "waste time over feed time", at_least=4.0, note="less risks an overflow")
     waste_extra_s: float = setting(4.4, "additional waste time", "s", at_least=4.0, note="less risks an overflow")
     clear_every: int = setting(5, "doses between two clearings of the waste tube", at_least=1)
-    clear_duty: float = setting(0.25, "of 63 s: how long the waste pump then runs", above=0.0, at_most=MAX_WASTE_DUTY)
+    clear_duty: float = setting(0.25, "fraction of 63 s for which it is cleared", above=0.0, at_most=MAX_WASTE_DUTY)
 
     def __post_init__(self) -> None:
         check(self, "dosing")
@@ -90,25 +90,25 @@ class DosingConfig:
 
 @dataclass(frozen=True)
 class SupplyConfig:
-    """Spare pumps that give a second medium, an inducer or a stressor; none as a rule, as their tubes are not there."""
+    """Spare pumps for a second medium, an inducer or a stressor; a standard reactor has no tubes on them."""
 
     pump3_ml_s: float = setting(0.0, "weighed flow of Pump3 at full power; 0: no tube", "mL/s", within=(0, 1.5))
     pump4_ml_s: float = setting(0.0, "weighed flow of Pump4 at full power; 0: no tube", "mL/s", within=(0, 1.5))
-    bias_s: float = setting(0.0, "extra time for which both pumps run, as weighed", "s", within=(-0.2, 0.5))
+    bias_s: float = setting(0.0, "weighed extra time for which both pumps run", "s", within=(-0.2, 0.5))
 
     def __post_init__(self) -> None:
         check(self, "backend.supply")
-        for pump in self.pumps:  # else a dose that it cannot deliver would be owed for ever, in the feed's place
+        for pump in self.pumps:  # a dose that is too small for the pump would block the feed for ever
             key, flow = f"backend.supply.{pump.lower()}_ml_s", self.flow_ml_s(pump)
             least = self.calibration(pump).min_dose_ml
             require(flow >= 0.2, key, flow, "0 or 0.2 to 1.5 mL/s")
-            require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
+            require(least <= DOSE_ML, key, flow, f"a flow that gives at most {DOSE_ML:g} mL in 0.3 s plus bias_s")
 
     def calibration(self, pump: str) -> PumpCalibration:
         return PumpCalibration(flow_ml_s=self.flow_ml_s(pump), bias_s=self.bias_s)
 
     def flow_ml_s(self, pump: str) -> float:
-        """Flow of a spare pump, 0 for every other one."""
+        """Return the flow of a spare pump, mL/s; 0 for other pumps."""
         return {"Pump3": self.pump3_ml_s, "Pump4": self.pump4_ml_s}.get(pump, 0.0)
 
     def most_ml(self, pump: str) -> float:
@@ -122,9 +122,9 @@ class SupplyConfig:
 
 @dataclass(frozen=True)
 class DosePlan(Plan):
-    """One dose as the device takes it: feed and waste duty, its targets.
+    """One dose as the device receives it: duties of feed and waste pump.
 
-    shortfall_ml: cut off by the limit of the feed duty and not carried. pump: that feeds.
+    shortfall_ml: volume that the limit of the feed duty cut off; it is not carried over. pump: pump that feeds.
     """
 
     feed_duty: float = 0.0
@@ -144,26 +144,26 @@ class DosePlan(Plan):
 def plan_dose(
     rate: float, carry_ml: float, doses: int, calibration: ReactorCalibration, config: DosingConfig
 ) -> DosePlan:
-    """Plan the dose that brings `rate` over one control period, together with what earlier periods left over.
+    """Plan the dose that gives `rate` over one control period plus the volume carried over from earlier periods.
 
-    feed duty = (v / q - bias) / 63 with v = rate * period + carry; nothing is dosed while v is below the smallest dose,
-    v is then the new carry. So the mean flow is right even for rates whose single doses the pump cannot deliver.
-    Args: rate: mean feed rate, mL/s. carry_ml: of the previous plan, mL. doses: given so far; every `clear_every`-th
-      clears the waste tube.
+    feed duty = (v / q - bias) / 63 with v = rate * period + carry. While v is below the smallest dose, nothing is dosed
+    and v becomes the new carry, so the mean flow is right even if single doses are too small for the pump.
+    Args: rate: mean feed rate, mL/s. carry_ml: carry of the previous plan, mL. doses: number of doses given so far;
+      every `clear_every`-th dose clears the waste tube.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):
         raise ValueError(f"pump rate = {rate} mL/s: allowed a finite number >= 0")
     feed, waste = calibration.feed, calibration.waste
     volume = rate * CONTROL_S + carry_ml
-    # a rate of 0 doses nothing: what was carried waits until the controller asks for fluid again
+    # at a rate of 0 the carry waits until the controller requests feed again
     if rate == 0.0 or volume < feed.min_dose_ml or volume == 0.0:
         return DosePlan(carry_ml=min(volume, feed.min_dose_ml))
-    duty = math.floor(feed.on_time(volume) / PERIOD_S * 1e6) / 1e6  # what the URL carries
+    duty = math.floor(feed.on_time(volume) / PERIOD_S * 1e6) / 1e6  # digits of the URL
     feed_duty = min(duty, MAX_FEED_DUTY)
     feed_s = PERIOD_S * feed_duty
     feed_ml = feed.volume(feed_s)
-    # the law of the tubes in seconds, and never less than 1.5 times the fed volume if the waste pump is the weaker
+    # factor * feed time + extra, and at least 1.5 times the fed volume if the waste pump is weaker
     waste_s = max(config.waste_factor * feed_s + config.waste_extra_s, waste.on_time(1.5 * feed_ml))
     if (doses + 1) % config.clear_every == 0:
         waste_s = max(waste_s, PERIOD_S * config.clear_duty)
@@ -192,11 +192,11 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
 
     Each series of n doses of t seconds weighs g grams, so its mean dose g/n has variance proportional to 1/n: weighted
     linear regression of g/n on t with weights n. The spread of a single dose follows from the weighted residuals. The
-    smallest useful on-time is the shortest one weighed whose mean dose is at least 0.7 of the fitted line, not under
-    0.3 s (docs/device.md, Pumps).
+    shortest reliable on-time is the shortest weighed one whose mean dose is at least 0.7 of the fitted line, and at
+    least 0.3 s (docs/device.md, Pumps).
 
-    Args: on_s: asked on-time of K series, s, > 0, at least two different ones. doses: their numbers of doses, grams:
-      what they delivered, all of shape (K,).
+    Args: on_s: requested on-time of each series, s, > 0, at least two different values. doses: number of doses of each
+      series. grams: weight of each series, g. All of shape (K,).
     Raises: ValueError if the series cannot determine a line, or the fitted pump is out of range.
     """
     t, n, y = (np.asarray(a, dtype=np.float64) for a in (on_s, doses, grams))
@@ -214,7 +214,7 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
     residual = dose - flow * (t + bias)
     freedom = t.size - 2
     sigma = math.sqrt(float(np.sum(n * residual**2)) / freedom) if freedom > 0 else math.nan  # mL, of one dose
-    slopes = np.array([-bias, 1.0]) / flow  # of the bias, by flow and dose at 0 s
+    slopes = np.array([-bias, 1.0]) / flow  # of the bias, in flow and in dose at 0 s
     flow_se, bias_se = sigma * math.sqrt(covariance[0, 0]), sigma * math.sqrt(slopes @ covariance @ slopes)
     spread = min(sigma / float(np.mean(dose)), 1.0) if math.isfinite(sigma) else 0.1
     useful = t[dose >= 0.7 * flow * np.maximum(t + bias, 1e-9)]

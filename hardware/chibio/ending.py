@@ -1,8 +1,8 @@
-"""What became of a dose: pure functions, for a life of the program that saw its end and for one that did not.
+"""Outcome of a dose as pure functions, also if the program did not see the end of the dose.
 
-A pump that is on gives its dose again every 63 s until it is off (docs/device.md, Pumps). When it went on and off is
-known from answers, from what a read finds, and from the dead-man switch of a board agent. Where none of them says it
-exactly, it lies between two times, and what was given between two volumes.
+A pump that is on repeats its dose every 63 s until it is off (docs/device.md, Pumps). The times at which it went on and
+off follow from answers, from reads, and from the dead-man switch of a board agent. A time that none of these gives
+exactly lies between two bounds, and so does the volume.
 """
 
 import math
@@ -16,18 +16,18 @@ from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory, Span
 from hardware.storage.doses import Ending
 
-SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last request that it heard is not on record
-SAME_S = 1e-3  # on-times that differ by less are one target: a path carries six digits of it
-MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer
+SWITCH_S = 10.0  # an agent acts up to this long after the silence that the journal shows
+SAME_S = 1e-3  # on-times that differ by less count as one target: a path carries six digits
+MOTOR_S = 0.7  # a motor starts at most this long after the answer, and a period is at most this much longer
 
-OFF = (  # what speaks for a pump that is found off, and the two times between which it went off: the first row decides
+OFF = (  # a pump is found off: evidence, and the two times between which it went off; the first row that holds counts
     ("the device was restarted", "last answer", "now"),
     ("an agent says when", "agent", "agent"),
     ("an agent that does not say had the time", "on", "silence"),
     ("it was asked off without an answer", "tried", "now"),  # done at once, or when a tunnel delivered it
     ("the experiment was ended", "last answer", "now"),
     ("its program was killed, and its waste pump is on", "end", "end"),  # by that program; an agent ends both
-    ("it was not heard to go on", "asked", "asked"),  # and never did
+    ("no answer says that it went on", "asked", "asked"),  # and it never did
     ("nothing", "on", "now"),  # somebody switched it off
 )
 
@@ -36,9 +36,9 @@ OFF = (  # what speaks for a pump that is found off, and the two times between w
 class _Pump:
     """One pump in an open dose.
 
-    asked_s: run time at which it was asked on, inf if it never was. on, off: run times between which it went on and
-    off, nan if not known. tried_s: run time at which it was first asked off in vain, nan if it never was. dose_s:
-    on-time as planned. anew: run time since which somebody else may have switched it on, and the on-time then.
+    asked_s: run time of the on command, inf if none was sent. on, off: run times between which the pump went on and
+    off, nan if unknown. tried_s: run time of the first off command that failed, nan if none did. dose_s: planned
+    on-time, s. anew: run time since which somebody else may have switched the pump on, and its on-time then, s.
     """
 
     part: str
@@ -51,7 +51,7 @@ class _Pump:
     anew: Span
 
     def on_s(self, now_s: float) -> tuple[float, float, float]:
-        """Least and most seconds for which it was on, and for which it may have been on anew; it is off by now."""
+        """Return the least and the most seconds it was on, and how long it may have been on anew, until now_s."""
         first, last = (now_s, now_s) if math.isnan(self.off[1]) else self.off
         most, anew = max(last - self.asked_s, 0.0), 0.0
         if not math.isnan(since_s := self.anew[0]):
@@ -78,15 +78,15 @@ def found(
     known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float, silence_s: float,
     stopped: Mapping[str, float] | None, killed: bool = False,
 ) -> dict[str, Span | None]:  # fmt: skip
-    """Find what a look at the device adds to what is `known` of an open dose: when its pumps went on or off.
+    """Find what a read adds to the `known` facts of an open dose: when its pumps went on or off.
 
-    None takes back what was answered and is not so; then it may be on anew, or the look may be an old answer delivered
-    again, so what was answered stays the least. So it is where another target is found than was set. Of a pump that is
-    found off `OFF` says when it went off.
+    A value of None revokes an off time that the read contradicts: the pump may be on anew, or the read may be an old
+    answer that arrived again. The smallest volume still counts up to the revoked time. The same holds if the read shows
+    another target than was set. `OFF` gives the time at which a pump that is found off went off.
 
-    Args: state: as read at run time now_s. seen_s: run time of the last answer before that. silence_s: of this program,
-      after which a board agent, if there is one, switches pumps off. stopped: pump, run time at which an agent switched
-      it off; None: it does not say. killed: the dose was open before a resume, its last command is not on record.
+    Args: state: read at run time now_s. seen_s: run time of the last answer before. silence_s: silence of this program
+      after which a board agent, if present, switches pumps off. stopped: by pump, run time at which an agent switched
+      it off; None: no report. killed: the dose was open before a resume, and its last command is not on record.
     """
     added: dict[str, Span | None] = {}
     restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)
@@ -95,7 +95,7 @@ def found(
         on_heard, off_heard = not math.isnan(pump.on[1]), not math.isnan(pump.off[1])
         agent_s = (stopped or {}).get(pump.name, math.nan)
         if (is_on or not math.isnan(agent_s)) and not on_heard:
-            heard_s = now_s if is_on else agent_s - silence_s + SWITCH_S  # an agent waits from the last request on
+            heard_s = now_s if is_on else agent_s - silence_s + SWITCH_S  # an agent counts from the last request
             added[f"{pump.part}_on"] = (asked_s, min(max(asked_s, heard_s), now_s))
         if is_on and (off_heard or not math.isnan(pump.tried_s)):
             added[f"{pump.part}_off"] = None
@@ -126,15 +126,15 @@ def found(
 def conclude(
     known: ReactorHistory, now_s: float, feed: PumpCalibration, waste: PumpCalibration
 ) -> tuple[Ending, Message | None]:
-    """How the open dose in `known`, verified off at run time now_s, ended, and what is not as planned, or None."""
+    """Conclude the open dose in `known`, verified off at run time now_s; return its end, and a note or None."""
     fed, wasted = _pumps(known)
     least_s, most_s, anew_s = fed.on_s(now_s)
     low_ml, low_times, low_last_ml = _runs(least_s, fed.dose_s, PERIOD_S + MOTOR_S, feed)
     feed_ml, feed_times, feed_last_ml = _runs(most_s, fed.dose_s, PERIOD_S, feed)
-    if anew_s > 0.0:  # told as further repetitions, of which the last may be larger
+    if anew_s > 0.0:  # booked as further repetitions; the last one may be larger
         once_ml, times, last_ml = _runs(anew_s, fed.anew[1], PERIOD_S, feed)
         feed_times, feed_last_ml = feed_times + times + 1, max(once_ml * max(times, 1) + last_ml - feed_ml * times, 0.0)
-    waste_s = min(wasted.dose_s, wasted.anew[1])  # the former where the latter is nan
+    waste_s = min(wasted.dose_s, wasted.anew[1])  # min(x, nan) is x
     waste_ml, waste_times, waste_last_ml = _runs(replace(wasted, anew=NEVER).on_s(now_s)[1], waste_s, PERIOD_S, waste)
     number = 0 if known.feed_pump == FEED else PUMPS.index(known.feed_pump) + 1
     ending = Ending(
@@ -145,7 +145,7 @@ def conclude(
 
 
 def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) -> tuple[float, int, float]:
-    """Return what a pump gives that is on for so long: its dose, mL, its repeats, and what the last repeat gave."""
+    """Return what a pump gives in on_s seconds: first dose, mL; number of repeats; volume of the last repeat, mL."""
     times = int(on_s // period_s)
     last_ml = pump.volume(min(dose_s, on_s - times * period_s)) if times else 0.0
     return pump.volume(min(dose_s, on_s)), times, last_ml

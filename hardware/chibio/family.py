@@ -25,10 +25,10 @@ Link = tuple[Transport, Clock]
 
 @contextmanager
 def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
-    """Open the link to a device that no other client has, and the device's clock.
+    """Open the link to a device, for this client alone, and the device's clock.
 
-    Args: own_url: of a device that was started for this run alone, in the place of the config's.
-    Raises: ReactorError if nothing answers, or another client on this computer has the device, by whatever name.
+    Args: own_url: address of a device that was started for this run; replaces the config's address.
+    Raises: ReactorError if nothing answers, or another client on this computer uses the device, under any name.
     """
     with ExitStack() as stack:
         url = own_url or backend.url
@@ -76,21 +76,19 @@ class ChiBioFamily(Family):
     def tube(self, backend: ChiBioConfig, number: int, most_ml: float, who: str) -> None:
         key, pump = f"backend.supply.pump{number}_ml_s", f"Pump{number}"
         if pump not in backend.supply.pumps:
-            remedy = f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
+            remedy = f"weigh its flow at full power (docs/scenarios.md) and set {key}"
             raise UnfitError(f"{who}: {pump} has no tube; {remedy}")
         if (can := backend.supply.most_ml(pump)) < most_ml - 1e-9:
-            remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller bench.max_rate"
+            remedy = f"allowed {most_ml:.2f} mL or more; use a wider tube or a smaller bench.max_rate"
             raise UnfitError(f"{key}: {pump} gives at most {can:.2f} mL a dose: {remedy}")
 
     def doses(self, backend: ChiBioConfig, bench: Bench) -> None:
         if bench.period_s != CONTROL_S:
-            where = f"allowed {CONTROL_S:g} with backend={backend.kind}, which measures so often"
+            where = f"allowed {CONTROL_S:g}, the time between measurements of backend={backend.kind}"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {where}")
         for name in backend.reactors:
             if not LEAST_ML <= (ml := bench.volume_of(name)) < VIAL_ML:
-                allowed = (
-                    f"allowed {LEAST_ML:g}, which the device takes, to less than {VIAL_ML:g}, which the vial holds"
-                )
+                allowed = f"allowed {LEAST_ML:g} (the device's smallest) to less than {VIAL_ML:g} (the vial's volume)"
                 raise UnfitError(f"bench.volume_ml = {ml:g} mL of {name}: {allowed}")
 
     def rim_ml(self, volumes_ml: Array) -> float:

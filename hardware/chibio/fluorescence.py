@@ -1,7 +1,7 @@
-"""Fluorescence of a culture: one slot of the device measures it with every cycle, if this run has it switched on.
+"""Fluorescence of a culture: one slot of the device measures it in every cycle while the slot is on.
 
-A slot is switched by one route, which acts on the selected reactor and toggles (docs/device.md, Fluorescence). So it is
-read first, toggled only if it has to be, and read back. It costs about a second of each cycle and moves nothing.
+The only route that switches a slot toggles it, on the selected reactor (docs/device.md, Fluorescence). The slot is
+therefore read first, toggled only if needed, and read back. A slot takes about a second of each cycle.
 """
 
 import math
@@ -18,17 +18,17 @@ HIDDEN = "not shown with its settings: update the device's software or the agent
 
 @dataclass(frozen=True)
 class FluorescenceSlotConfig:
-    """Which slot measures what; as a rule none.
+    """Settings of the fluorescence measurement; off by default.
 
-    The defaults are for pyoverdine, 395 nm in and 440 nm out, as in Lee, Morlock, Allan, Steel, Cell Reports Methods
-    5:101009 (2025) and their device software Janmorlock/ChiBio.
+    The defaults are for pyoverdine (excitation 395 nm, emission 440 nm), as in Lee, Morlock, Allan, Steel, Cell Reports
+    Methods 5:101009 (2025) and their device software Janmorlock/ChiBio.
     Raises: ValueError naming key, value and allowed range.
     """
 
     measure: bool = setting(False, "measure fluorescence with every sample")
     slot: str = setting("FP1", "fluorescence slot of the device; the others must be off", choices=SLOTS)
     led: str = setting("LEDA", "excitation: LEDA 395 nm, LEDB 457, LEDC 500, LEDD 523, LEDE 595", choices=LEDS)
-    base_band: str = setting("CLEAR", "band by which the device divides", choices=BANDS)
+    base_band: str = setting("CLEAR", "base band: the device divides by its counts", choices=BANDS)
     band: str = setting("nm440", "emission band; not the base band", choices=BANDS)
     gain: str = setting("x10", "gain code of the spectrometer", choices=tuple(f"x{k}" for k in range(11)))
 
@@ -42,11 +42,11 @@ class FluorescenceSlotConfig:
         return f"/SetFPMeasurement/{'/'.join(settings)}" if self.measure else ""
 
     def own(self, state: DeviceState) -> Slot | None:
-        """Return the configured slot; None if the device does not show it, or it is on without its settings."""
+        """Return the configured slot; None if the device does not show it, or shows it on without its settings."""
         return next((s for s in state.slots if s.name == self.slot and (s.led or not s.on)), None)
 
     def wrong(self, state: DeviceState) -> str:
-        """Say what is wrong with the slot in a read; "" if all is well or nothing is measured."""
+        """Return what is wrong with the slot in a read; "" if nothing is wrong or nothing is measured."""
         if not self.measure:
             return ""
         slot = self.own(state)
@@ -63,24 +63,24 @@ class FluorescenceSlotConfig:
 
 
 class Fluorescence:
-    """The fluorescence slot of one reactor: looked at with every read, put right, read back.
+    """The fluorescence slot of one reactor: checked with every read, corrected, read back.
 
-    Attributes: trouble, why it could not be verified on, None if it was.
+    Attributes: trouble: why the slot could not be verified on, None if it was.
     """
 
     def __init__(self, connection: Connection, config: FluorescenceSlotConfig, book: Logbook) -> None:
         self.trouble: SlotAmiss | None = None
         self._connection, self._config, self._book = connection, config, book
         self._was_on = False
-        self._switched_in = -1  # the cycle in which it was last toggled, which may have been after its measurement
+        self._switched_in = -1  # cycle of the last toggle; its measurement may have been before
 
     def keep_on(self, state: DeviceState) -> DeviceState:
-        """Have the slot on as configured; return the state then. What cannot be had is `trouble`. Raises: as `read`."""
+        """Switch the slot on as configured if needed; return the new state. Sets `trouble`. Raises: as `read`."""
         found = still = self._config.wrong(state)
         if found not in ("", HIDDEN):
             self._switched_in = state.cycles
             state, still = self._toggle()
-            if found != "off" and still == "off":  # it takes its settings when it goes on
+            if found != "off" and still == "off":  # a slot takes settings only when it goes on
                 state, still = self._toggle()
         slot = self._config.slot
         self.trouble = SlotAmiss(slot=slot, found=still) if still else None
@@ -94,7 +94,7 @@ class Fluorescence:
         return state, self._config.wrong(state)
 
     def reading(self, state: DeviceState) -> float:
-        """Return the counts of the band in the sample that `state` brought; nan where there are none."""
+        """Return the counts of the band in the sample of `state`; nan if there are none."""
         slot, old = self._config.own(state), state.cycles == self._switched_in
         if old or slot is None or not self._config.measure or self._config.wrong(state):
             return math.nan

@@ -1,9 +1,8 @@
-"""The overflow pump: a second waste tube a little above the first, on a spare pump that the device runs by itself.
+"""The overflow pump: a spare pump on a second waste tube, slightly above the first tube.
 
-It sucks air unless the level rises, so it may run all the time: `target` = duty and ON, and the pump repeats that every
-63 s without a client (docs/device.md, Pumps), whatever becomes of doses, trips and this program. The experiment cycle
-does not look at Pump3 and Pump4; a start or end of an experiment and a restart of the device switch them
-off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/device.md, The overflow pump.
+The tube draws air unless the level rises, so the pump may run all the time. Once it is ON with a target, the device
+runs it every 63 s without a client (docs/device.md, Pumps). A start or end of an experiment and a restart of the device
+switch it off. Nothing relies on it: the interlock's ledger ignores it. Plumbing: docs/device.md, The overflow pump.
 """
 
 from dataclasses import dataclass
@@ -14,12 +13,12 @@ from hardware.chibio.messages import OverflowPumpAmiss, PutRight
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
 from hardware.logbook import Logbook
 
-MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever be told to deliver
+MIN_DUTY = 0.1  # at 1 mL/s, twice the largest feed that may be commanded
 
 
 @dataclass(frozen=True)
 class OverflowPumpConfig:
-    """A second waste line that keeps a vial from overflowing (docs/device.md, The overflow pump); none as a rule.
+    """A second waste line against overflow of a vial (docs/device.md, The overflow pump); off by default.
 
     Raises: ValueError naming key, value and allowed range.
     """
@@ -43,11 +42,11 @@ class OverflowPumpConfig:
 
     @property
     def removes_ml_s(self) -> float:
-        """Mean flow it can take off above its tube, mL/s; 0 if there is none."""
+        """Mean flow that the overflow pump can remove, mL/s; 0 without an overflow pump."""
         return self.duty * self.flow_ml_s if self.pump else 0.0
 
     def wrong(self, state: DeviceState) -> str:
-        """Say what is wrong with the overflow pump in a read; "" if all is well, or there is none."""
+        """Return what is wrong with the overflow pump in a read; "" if it runs as set, or there is none."""
         if not self.pump:
             return ""
         k = PUMPS.index(self.pump)
@@ -59,9 +58,9 @@ class OverflowPumpConfig:
 
 
 class OverflowPump:
-    """The overflow pump of one reactor: looked at with every read, put right, read back.
+    """The overflow pump of one reactor: checked with every read, corrected, read back.
 
-    Attributes: trouble, why it could not be verified on, None if it was; was_on, whether it was known to be on.
+    Attributes: trouble: why the pump could not be verified on, None if it was. was_on: the pump was verified on before.
     """
 
     def __init__(self, connection: Connection, config: OverflowPumpConfig, book: Logbook) -> None:
@@ -70,7 +69,7 @@ class OverflowPump:
         self._connection, self._config, self._book = connection, config, book
 
     def keep_on(self, state: DeviceState) -> DeviceState:
-        """Have it on with its duty; return the state then. What cannot be had is `trouble`. Raises: ReactorError."""
+        """Switch the pump on at its duty if needed; return the new state. Sets `trouble`. Raises: ReactorError."""
         config, connection = self._config, self._connection
         if not (found := config.wrong(state)):
             self.trouble, self.was_on = None, self.was_on or bool(config.pump)

@@ -1,4 +1,4 @@
-"""Before a run: one line per check, passed or with the remedy. Changes only which reactor is selected."""
+"""Checks before a run: one line each, passed or with a remedy. They change only which reactor is selected."""
 
 import math
 import shutil
@@ -31,10 +31,10 @@ def preflight(
     folder: Path | None = None,
     bench: Bench | None = None,
 ) -> list[Check]:
-    """Disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors, pump calibration.
+    """Check disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors and pumps.
 
-    Args: as for `ChiBioReactors`; folder: where the run will write, its disk is checked.
-    Raises: nothing about the device; a check that cannot be made has failed.
+    Args: as for `ChiBioReactors`; folder: the run's folder, whose disk is checked.
+    Raises: nothing about the device; a check that cannot be made counts as failed.
     """
     checks = [_disk(folder)] if folder is not None else []
     fullest_ml = float((bench or Bench()).volumes(config.reactors).max())
@@ -51,7 +51,7 @@ def preflight(
                 connection.probe()  # a device that never ran an experiment shows no temperature yet
                 state = connection.read()
         except ReactorError as error:
-            remedy = "plug it in with the server stopped, or leave it out"
+            remedy = f"stop the server and plug it in, or remove {name} from backend.reactors"
             checks.append(Check(f"{name} present", False, str(error), remedy))
             continue
         found = f"identity {state.device_id}, software {state.version or 'unnamed'}"
@@ -67,7 +67,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _link(transport: Transport, clock: Clock, speed: float) -> Check:
-    """How long an answer takes, device s. An emulator in fast motion is as slow as its computer is busy."""
+    """Check the time until an answer, device s. With a fast emulator it depends on the load of the computer."""
     start = clock.now()
     for _ in range(3):
         transport.get("/getSysdata/")
@@ -77,7 +77,7 @@ def _link(transport: Transport, clock: Clock, speed: float) -> Check:
 
 
 def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Check:
-    """Whether the board's clock runs evenly; what it shows does not matter (docs/device.md, Failures)."""
+    """Check that the board's clock runs evenly; its absolute time does not matter (docs/device.md, Failures)."""
     dates, times = [], []
     for pause in (5.0, 0.0):
         reply = transport.get("/getSysdata/")
@@ -94,7 +94,7 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
 
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration], room_ml: float) -> Check:
-    """Check what the overflow pump covers; room_ml is above the fullest culture."""
+    """Check which failures the overflow pump covers. Args: room_ml: free volume above the fullest culture, mL."""
     overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
     if not overflow.pump:
         return Check(

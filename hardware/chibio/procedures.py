@@ -16,7 +16,7 @@ LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus
 
 
 def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
-    """Give `doses` single doses of 63 s * `duty`, one per step, verified off after each; yield how many.
+    """Give `doses` single doses of 63 s * `duty`, one per step, verified off after each; yield the number so far.
 
     Raises: DeviceStateError if an experiment runs or a dose did not begin; LinkError, ProtocolError.
     """
@@ -41,8 +41,8 @@ def warm_up(
 ) -> Iterator[tuple[float, float]]:
     """Wait until every reactor is within `tolerance` degC of its thermostat in two samples in a row.
 
-    Yields, every `every_min`, the minutes that have passed and the temperature that is farthest off.
-    Raises: SensorError if that takes longer than `limit_min`; ReactorError.
+    Yields, every `every_min` minutes, the minutes passed and the temperature farthest from the target, degC.
+    Raises: SensorError after `limit_min` minutes; ReactorError.
     """
     target, start, reached = reactors.config.temperature, reactors.elapsed(), np.zeros(len(reactors.names))
     due = 0.0
@@ -74,9 +74,9 @@ def _sound(reactors: ChiBioReactors) -> Measurement:
 def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array]:
     """Average the raw counts of `samples` cycles of clear medium, set them as blanks; return mean and sd, shape (N,).
 
-    Needs stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own measurement, so
-    they hold under run conditions (docs/device.md, Blank).
-    Raises: SensorError for counts that cannot be or scatter by more than 2 %; ReactorError.
+    Needs stirred, heated vials and `reactors.begin()`. The experiment itself measures the counts, so they are valid
+    under run conditions (docs/device.md, Blank).
+    Raises: SensorError for counts outside 3000 to 60000 or with a scatter above 2 %; ReactorError.
     """
     rows: list[list[float]] = [[] for _ in reactors.names]
     while min(map(len, rows)) < samples:

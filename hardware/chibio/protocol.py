@@ -1,6 +1,6 @@
-"""The Chi.Bio's language as pure functions: its state out of JSON, and the few commands a client may ever send.
+"""The Chi.Bio's protocol as pure functions: parse its state from JSON, check the few commands that a client may send.
 
-Nothing here talks to a device. Facts and traps: docs/device.md.
+Nothing here talks to a device. Sources: docs/device.md.
 """
 
 import json
@@ -16,17 +16,17 @@ POSITIONS = tuple(f"M{k}" for k in range(8))
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
-"""Without tubes on a standard reactor; one of them may be an overflow pump (`overflow_pump.py`)."""
+"""Pumps without tubes on a standard reactor; one of them may be an overflow pump (`overflow_pump.py`)."""
 MAX_OVERFLOW_DUTY = 0.95
-"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
+"""Below 1, because the device does not switch a pump of duty 1 off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
 LEAST_ML = 10.0
-"""A smaller culture is not told to the device's own regulator."""
+"""Smallest culture volume that is sent to the device, mL."""
 CONTROL_S = 60.0
 """One dose per cycle of the device: the control period, s."""
 MAX_TEXT = 160
-"""Characters of a text of the device that are taken; the longest line of its log that matters has 80."""
+"""Characters kept of a text from the device; the longest relevant line of its log has 80."""
 UNSET_BLANK = 65000.0
 """Blank of a device that lost its memory or was never calibrated (docs/device.md, Blank)."""
 SLOTS = ("FP1", "FP2", "FP3")
@@ -36,7 +36,7 @@ BANDS = ("nm410", "nm440", "nm470", "nm510", "nm550", "nm583", "nm620", "nm670",
 
 _NUMBER = r"[0-9]{1,6}(?:\.[0-9]{1,12})?"
 _LIMITS: Mapping[str, tuple[float, float]] = {
-    "Pump1": (0.0, 0.05),  # fifty times less than what the pump can do; the on-board regulator stays below 0.02
+    "Pump1": (0.0, 0.05),  # a twentieth of full power; the on-board regulator stays below 0.02
     "Pump2": (0.0, 0.5),  # a waste dose must end before the next measurement
     "Pump3": (0.0, 0.0),
     "Pump4": (0.0, 0.0),
@@ -52,9 +52,9 @@ _MAY_GO_ON = ("Pump1", "Pump2", "OD", "Stir", "Thermostat")
 
 @dataclass(frozen=True)
 class Slot:
-    """A fluorescence slot: whether it is on, and then how it measures, and what it measured last.
+    """A fluorescence slot: whether it is on and, if so, its settings and last values.
 
-    base: counts of the base band. emission: counts of `band` over `base`.
+    base: counts of the base band. emission: counts of `band` divided by `base`.
     """
 
     name: str
@@ -74,12 +74,12 @@ class Slot:
 
 @dataclass(frozen=True)
 class DeviceState:
-    """What a client needs of one reactor's state. Times in s, temperatures in degC, blank and raw in counts.
+    """The part of one reactor's state that a client needs. Times in s, temperatures in degC, blank and raw in counts.
 
     sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
     just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
-    regulation. modes: what else would act on its own. slots: of fluorescence, those that the device shows. spoilt:
-    items that hold no number, at whose dump in every tenth cycle the thread ends.
+    regulation. modes: other modes that are on. slots: fluorescence slots that the device shows. spoilt: items that hold
+    a nan; the device's thread ends when it saves them, in every tenth cycle.
     """
 
     selected: str
@@ -120,7 +120,7 @@ class DeviceState:
 
     @property
     def ended(self) -> bool:
-        """Whether the log's newest line is of the end: "Experiment Stopped", newer "Experiment on M0 (ID) Stopped"."""
+        """Whether the log's newest line is "Experiment Stopped" or, in newer apps, "Experiment on M0 (ID) Stopped"."""
         return re.search(r"\bExperiment\b.*\bStopped\b", self.terminal) is not None
 
     @property
@@ -155,7 +155,7 @@ def _flag(data: Any, *keys: str) -> bool:
 
 
 def _line(text: str) -> str:
-    """One line of printable ASCII, cut: the device's words end up in every row of the journal."""
+    """Return printable ASCII of limited length, because the journal stores the device's texts."""
     return re.sub(r"[^ -~]", "?", text[:MAX_TEXT])
 
 
@@ -167,7 +167,7 @@ def _text(data: Any, *keys: str) -> str:
 
 
 def _newest(data: Any) -> tuple[float, ...]:
-    """Last entries of the three records, nan while the device replaces its lists; an agent sends lengths apart."""
+    """Return the last entries of the three records, nan while the lists differ in length (an agent sends lengths)."""
     lists = {name: _get(data, name, "record") for name in ("time", "OD", "ThermometerIR")}
     if not all(isinstance(x, list) for x in lists.values()):
         raise NotUnderstood(what="a record is not a list")
@@ -196,7 +196,7 @@ def _slot(data: Any, name: str) -> Slot:
 
 
 def parse_state(body: bytes) -> DeviceState:
-    """Parse the answer to GET /getSysdata/; unknown fields are ignored, NaN is a reading. Raises: ProtocolError."""
+    """Parse the answer to GET /getSysdata/; ignore unknown fields, accept NaN as a number. Raises: ProtocolError."""
     try:
         data = json.loads(body)
     except (ValueError, RecursionError) as error:
@@ -241,11 +241,11 @@ def parse_state(body: bytes) -> DeviceState:
 
 @dataclass(frozen=True)
 class Permitted:
-    """What a client may command beside the standard hardware.
+    """Reactors that a client may command, and commands beyond those of the standard hardware.
 
-    reactors: positions that it owns. overflow_pump: spare pump that may be switched on; "" if there is none.
-    slot_command: the one toggle that may be sent, that of the fluorescence slot of the selected reactor; "" if none may
-    be. supply_pumps: spare pumps that may give doses.
+    reactors: positions that the client controls. overflow_pump: spare pump that may be switched on; "" if none may.
+    slot_command: the only permitted toggle, of the selected reactor's fluorescence slot; "" if none is. supply_pumps:
+    spare pumps that may give doses.
     """
 
     reactors: Sequence[str]
@@ -255,12 +255,12 @@ class Permitted:
 
 
 def check_command(path: str, permitted: Permitted) -> None:
-    """Check a command before the wire: only these POSTs, only for these reactors, only within these limits.
+    """Check a command before it is sent: a known POST, for a permitted reactor, within the limits.
 
-    A spare pump may run only as the overflow pump, or as a supply pump within the limits of the feed. Everything else
-    the device understands wipes, toggles or kills something (docs/device.md, Routes and Client rules).
+    A spare pump may run only as the overflow pump, or as a supply pump within the limits of the feed. All other
+    commands of the device erase, toggle or end something (docs/device.md, Routes and Client rules).
 
-    Raises: DeviceStateError if the command is not one of them.
+    Raises: DeviceStateError if the command is not permitted.
     """
     if permitted.slot_command and path == permitted.slot_command:
         return

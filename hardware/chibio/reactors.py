@@ -1,9 +1,9 @@
 """Chi.Bio reactors as a `Reactor`: one verified single-shot dose per fresh sample, one to eight units, one thread.
 
-The device keeps stirring, heating, measuring and logging by itself; its own OD regulation stays off and the pumps are
-off except during a dose (docs/device.md, Dosing). Whatever must happen later (pump off, check, restart) is a task on
-an agenda that `measure` works through while it waits, so the doses of several reactors overlap and an end of dose is
-carried out even when other requests fail.
+The device stirs, heats, measures and logs without a client; its own OD regulation stays off and the pumps are off
+except during a dose (docs/device.md, Dosing). Later actions (pump off, check, restart) are tasks on an agenda that
+`measure` works through while it waits. The doses of several reactors can therefore overlap, and a dose is ended even
+when other requests fail.
 """
 
 import math
@@ -28,7 +28,7 @@ from hardware.link.transport import SharedLink, Transport
 from hardware.logbook import Log, Logbook, no_log
 from hardware.stations import Stations
 
-SLOWEST_S = 61.0  # a cycle of the device takes at most so long as a rule
+SLOWEST_S = 61.0  # a cycle of the device rarely takes longer
 
 
 class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
@@ -64,11 +64,11 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         )  # fmt: skip
 
     def bounds_s(self, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
-        """Return bounds on the run time, s, by how many cycles the devices have begun since their newest samples.
+        """Return bounds on the run time, s, from the cycles that the devices have begun since their newest samples.
 
-        A cycle takes 60 s or a little more, whatever any clock is set to. An experiment that somebody stopped for a
-        while counts too few, one that died counts none: with no cycle at all there is no upper bound.
-        Args: rows: of the run's journal.
+        A cycle takes 60 s or slightly more, whatever the clocks show. An experiment that was stopped for a while counts
+        too few cycles. An experiment that died counts none: without any cycle there is no upper bound.
+        Args: rows: rows of the run's journal.
         """
         low_s, most_s = 0.0, list[float]()
         newest = {row["reactor"]: row for row in rows if row["kind"] == "sample"}
@@ -83,10 +83,10 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         return low_s, max(most_s, default=math.inf)
 
     def _take_over(self, histories: Mapping[str, ReactorHistory]) -> None:
-        """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
+        """Switch the pumps off, pin identities and blanks, start the experiments that do not run, spread over a minute.
 
-        An experiment that already runs is adopted, never started again (a second start would stop it), and a reactor
-        that was handed over to the on-board regulation stays so.
+        A running experiment is adopted and not started again, because a second start would stop it. A reactor that was
+        handed over to the on-board regulation stays so.
         """
         self._past |= histories
         failed = list[ReactorError]()
@@ -101,7 +101,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         self._bring_up([station for station in self.stations if station.restored], resumed=bool(histories))
 
     def _bring_up(self, stations: Sequence[ChibioStation], resumed: bool) -> None:
-        """Each into its running state, starts staggered inside the minute; a resumed run goes on meanwhile."""
+        """Bring each station into its running state, with starts spread over a minute; a resumed run does not wait."""
         slot = 0
         for station in stations:
             running = station.connection.read().running
@@ -120,7 +120,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
                 raise messages.NotReady(reactor=station.name, trouble=trouble)
 
     def _between(self) -> None:
-        """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
+        """Run the tasks that are due now. A task that fails is dropped and logged; the others still run."""
         now = self._clock.now()
         while self._agenda.next_due() <= now:
             try:
@@ -132,12 +132,12 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         self._clock.sleep(max(min(longest_s, self._agenda.next_due() - self._clock.now()), 0.01))
 
     def stop(self) -> None:
-        """As `Stations.stop`, overflow pumps too; tried for `stop_s`, then escalated. A dead-man switch rests then."""
+        """Stop as `Stations.stop`, overflow pumps too: try for `stop_s`, then escalate. Disarm the dead-man switch."""
         super().stop()
         self._link.disarm()
 
     def _silence(self, stations: Sequence[ChibioStation]) -> dict[ChibioStation, ReactorError]:
-        """All pumps of these off, again and again, then by the end of their experiments; what could not be verified."""
+        """Switch all pumps of `stations` off, at last by ending experiments; return the errors of those that failed."""
 
         def failed(pending: Sequence[ChibioStation]) -> dict[ChibioStation, ReactorError]:
             return self._all(pending, lambda station: station.doses.settle(overflow_pump=True))
@@ -145,7 +145,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         deadline, tries = self._clock.now() + self.config.stop_s, 1
         pending = failed(stations)
         while pending and self._clock.now() < deadline:
-            if (tries := tries + 1) == REFUSALS:  # who answers and does not obey will not later either
+            if (tries := tries + 1) == REFUSALS:  # a reactor that answers and does not obey
                 for station in (one for one, error in pending.items() if isinstance(error, DeviceStateError)):
                     station.connection.escalate()
             self._clock.sleep(min(self.config.retry_s, 2.0))
@@ -156,7 +156,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
         return failed(list(pending))
 
     def end(self) -> None:
-        """`stop`, then end every experiment. Raises: ReactorError if one goes on."""
+        """Stop, then end every experiment. Raises: ReactorError if an experiment still runs."""
         self.stop()
         for station in self.stations:
             station.connection.post(f"/Experiment/0/{station.name}")
@@ -164,9 +164,9 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
                 raise messages.DoesNotEnd(reactor=station.name)
 
     def write(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Remember and log, or neither. Raises: what the log raises."""
+        """Add a row to the history and the log, or to neither. Raises: what the log raises."""
         before = dict(self._past)
-        row = self._remember(kind, fields)  # first: a stop may come right after it was written
+        row = self._remember(kind, fields)  # first, because a stop may come right after the write
         try:
             super().write(kind, row)
         except (OSError, ReactorError):
@@ -174,7 +174,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
             raise
 
     def note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Remember, and log without ever standing in the way of a pump-off."""
+        """Add a row to the history and the log; an error of the log never prevents a pump-off."""
         super().note_down(kind, self._remember(kind, fields))
 
     def _remember(self, kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""What a run remembers of each Chi.Bio reactor: all of it stands in the rows of its journal, oldest first.
+"""State that a run keeps of each Chi.Bio reactor: all of it follows from the rows of the journal, oldest first.
 
-A life of the program enters each row as it writes it; a resumed one begins with the rows of the lives before.
+The program updates this state with each row that it writes; a resumed program first replays the earlier rows.
 """
 
 import math
@@ -20,14 +20,14 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class ReactorHistory(History):
-    """What a run must remember of one reactor.
+    """State of one reactor, beyond that of `History`. A sample's key is (record time, cycles).
 
-    overflow_pump_on: it was verified on. start_time: of the device's experiment; a sample's key is (record time,
-    cycles). Of an open dose: feed_s, waste_s are its on-times as planned; feed_pump, which pump feeds; experiment,
-    start_time then. feed_on, waste_on, feed_off, waste_off: run times between which that pump went on or off, by the
-    answer to its command or by what was found; nan if not known. feed_tried, waste_tried: run time at which it was
-    first asked off in vain. feed_anew, waste_anew: run time since which somebody else may have switched it on anew, and
-    the on-time then, or nan.
+    overflow_pump_on: the overflow pump was verified on. start_time: start of the device's experiment. The others are of
+    an open dose. feed_s, waste_s: planned on-times, s. feed_pump: pump that feeds. experiment: start_time when the dose
+    began. feed_on, waste_on, feed_off, waste_off: run times between which this pump went on or off, from the answer to
+    its command or from a read; nan if unknown. feed_tried, waste_tried: run time of the first off command that failed.
+    feed_anew, waste_anew: run time since which somebody else may have switched the pump on, and its on-time then; nan
+    if nobody did.
     """
 
     device_id: str = ""
@@ -64,7 +64,7 @@ class ReactorHistory(History):
             )
         if kind == "found":
             said = {k: NEVER if (at := row[k]) is None else (float(at[0]), float(at[1])) for k in SPANS & row.keys()}
-            seen_s = float(row.get("time_s", math.nan))  # still on, although it was asked off: it goes off after that
+            seen_s = float(row.get("time_s", math.nan))  # still on after an off command, so it goes off later
             over = {
                 f"{key[:-4]}_tried": seen_s if at is NEVER else math.nan for key, at in said.items() if "off" in key
             }
@@ -72,7 +72,7 @@ class ReactorHistory(History):
         return replace(known, overflow_pump_on=True) if kind == "overflow_pump" else known
 
     def _switched(self, path: str, answer: int | str, at_s: float, took_s: float) -> Self:
-        """Note a pump switched in an open dose; the first answer of its kind counts, a refusal does not."""
+        """Note a pump command in an open dose; only the first successful answer to on and to off counts."""
         known = replace(self, wasted=self.wasted or path.startswith(f"/SetOutputOn/{WASTE}/1/"))
         for part, pump in (("feed", known.feed_pump), ("waste", WASTE)):
             for force, word in ((1, "on"), (0, "off")):

@@ -1,4 +1,4 @@
-"""What a sample of the device is: whether it is new, when it appeared, and when to look for the next one."""
+"""Samples of the device: whether one is new, when it appeared, and when to look for the next sample."""
 
 import math
 from collections import deque
@@ -17,11 +17,11 @@ FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 class Sampling(Newest):
     """The newest sample of one reactor.
 
-    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. The
-    smallest offset between the two clocks among samples that were waited for shows how late any other one was seen.
+    The device reports only the time at which a sample's cycle began, on the device's own clock. The smallest offset
+    between the two clocks, among samples that the program waited for, shows how late any other sample was seen.
 
-    Attributes: key, (record time, cycles) of the newest sample, None before the first; late_s, how long after it
-      appeared it was seen.
+    Attributes: key: (record time, cycles) of the newest sample, None before the first. late_s: time from the sample's
+      appearance until the program saw it, s.
     """
 
     def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
@@ -30,28 +30,28 @@ class Sampling(Newest):
         self.fluorescence = math.nan if config.fluorescence.measure else None
         self.key: tuple[float, int] | None = None
         self.late_s = 0.0
-        self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
+        self._offsets: deque[float] = deque(maxlen=3)  # arrival minus device time, of samples seen at once
         self._looked = False  # the last look found nothing new, so the next sample will be seen when it appears
 
     @property
     def appeared_s(self) -> float:
-        """Clock time at which the newest sample appeared; -inf if it was there already at the first look."""
+        """Clock time at which the newest sample appeared; -inf if it appeared before the first look."""
         return self.arrived_s - self.late_s
 
     def pass_over(self, state: DeviceState) -> None:
-        """Deliver the next new sample only: the one on record is of unknown age."""
+        """Ignore the sample on record, because its age is unknown."""
         if math.isfinite(state.sample_s):
             self.key = (state.sample_s, state.cycles)
         self._offsets.clear()
 
     def expect_first(self) -> None:
-        """Expect the first cycle: the device's own time begins now."""
+        """Expect the first cycle: the device's time starts at 0 now."""
         self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
 
     def look(self, state: DeviceState, now: float) -> bool:
-        """Whether `state` brings a new sample; plans the look after one that brings none.
+        """Return whether `state` has a new sample; if it has none, the next look is after `poll_s`.
 
-        `cycles` counts cycles begun: a sample that was seen late may carry the number of the next one already.
+        `cycles` counts cycles begun, so a sample that is seen late may already carry the next cycle's number.
         """
         self.next_look = now + self._config.poll_s
         return math.isfinite(state.sample_s) and (
@@ -59,11 +59,11 @@ class Sampling(Newest):
         )
 
     def not_taken(self, is_new: bool) -> None:
-        """Note a look without a sample to act on: there was none, or a new one that a fault forbids to use."""
+        """Note a look without a usable sample: there was none, or a fault forbids the use of a new one."""
         self._looked = not is_new
 
     def take(self, state: DeviceState, now: float) -> Message | None:
-        """Make a new sample, seen at `now`, the newest one; return what it shows of the board's clock, or None."""
+        """Store a new sample, seen at `now`; return a note if it came very late or the board's clock was set."""
         self.key = (state.sample_s, state.cycles)
         self.arrived_s = self.at = now
         self.od, self.temperature = state.sample_od, state.sample_temperature
@@ -74,10 +74,10 @@ class Sampling(Newest):
         return note
 
     def _measure_lateness(self, offset: float) -> Message | None:
-        """How much later than possible this sample was seen: its offset against the smallest of recent ones.
+        """Set `late_s`: this sample's offset minus the smallest recent offset. Return a note on a large step.
 
-        A step of the board's clock looks like lateness. Only samples that were waited for enter the measure, so three
-        of them replace the offsets of before.
+        A step of the board's clock looks like a late sample. Only samples that the program waited for add an offset,
+        and three of them replace all older offsets.
         """
         note: Message | None = None
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:

@@ -26,17 +26,17 @@ from hardware.stations import Station
 
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 MEASURING_S = 20.0  # settling, four readings, three temperatures and three fluorescence slots take less
-HELD_S = 30.0  # for so long a new sample waits for what the last dose came to
+HELD_S = 30.0  # longest time that a new sample waits for the volume of the last dose
 STARTS = 3  # attempts to start an experiment before it counts as failed
-AGAIN_S = 60.0  # from a restart that failed to the next one
+AGAIN_S = 60.0  # pause after a restart that failed
 
 
 class ChibioStation(Station):
     """One reactor under control.
 
-    Args: volume_ml: of its culture; else as of `DoseSequence`.
-    Attributes: sampling, doses, overflow_pump, fluorescence: its parts; busy, while the reactor is being started or
-      recovered; restored, whether it continues from the state before a resume.
+    Args: volume_ml: volume of the culture, mL; the others as in `DoseSequence`.
+    Attributes: sampling, doses, overflow_pump, fluorescence: its parts. busy: the reactor is being started or
+      recovered. restored: `restore` has succeeded.
     """
 
     def __init__(
@@ -51,16 +51,16 @@ class ChibioStation(Station):
         self.fluorescence = Fluorescence(connection, self._config.fluorescence, book)
         self.busy = self.restored = False
         self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
-        self._spoilt = False  # it was told that the device holds something that is no number
+        self._spoilt = False  # the run has reported that the device holds a nan
         self._ended = ""  # why this program ended the experiment, "" once it runs again
         self._target_c = self._config.temperature
         self._heat = True
         self._blank = math.nan
 
     def restore(self) -> None:
-        """Restore the state before a resume; pumps are verified off, unless the reactor regulates itself as left.
+        """Restore the state before a resume; verify the pumps off, unless the on-board regulation runs as handed over.
 
-        Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
+        Raises: ReactorError if the reactor is not reachable, is another unit, or keeps a pump on.
         """
         history = self._past()
         self.connection.device_id = history.device_id
@@ -79,11 +79,11 @@ class ChibioStation(Station):
         self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
-        """Task: have the experiment run as it should; adopt one that runs. Args: waited: no old cycle is left."""
+        """Task: start the experiment with the run's settings, or adopt it. Args: waited: no old cycle can be left."""
         try:
             yield from self._let_measure()
             state = self.connection.read()
-            if state.running and state.measuring:  # still: nobody measures there any more
+            if state.running and state.measuring:  # still, so the measurement is dead
                 self.book.say(messages.MeasuresTooLong(seconds=MEASURING_S))
                 self.connection.post(f"/Experiment/0/{self.name}")
                 state = self.connection.read()
@@ -112,7 +112,7 @@ class ChibioStation(Station):
             self.busy = False
 
     def take_over(self) -> Task:
-        """Start the reactor in a run that continues meanwhile; report a failure and try again."""
+        """Task: start the reactor in a run that continues meanwhile; report a failure. `poll` then tries again."""
         try:
             if not self.connection.read().running:
                 self.book.say(messages.StoppedMeanwhile())
@@ -122,10 +122,10 @@ class ChibioStation(Station):
             self.book.report(messages.NotTakenOver(error=error))
 
     def _let_measure(self) -> Task:
-        """Task: a measurement under way is over, or has taken too long; a blank changed in one would spoil it.
+        """Task: wait until a measurement is over or takes too long, because a new blank would spoil the measurement.
 
-        The device's flag says it only while an experiment runs: one that is stopped or dies in a measurement leaves it
-        for good, until the next start (docs/device.md, Cycle).
+        The device's flag is valid only while an experiment runs: an experiment that ends during a measurement leaves
+        the flag set until the next start (docs/device.md, Cycle).
         """
         since = self._clock.now()
         while (state := self.connection.read()).running and state.measuring:
@@ -134,7 +134,7 @@ class ChibioStation(Station):
             yield 2.0
 
     def _prepare(self) -> None:
-        """Blank and targets as they belong to this run; on-board regulation off, unless it was handed over to that."""
+        """Set the run's blank and targets; switch the on-board regulation off, unless the run handed over to it."""
         connection, state = self.connection, self.connection.read()
         if state.pumping_modes:
             raise messages.ModeOn(reactor=self.name, modes=", ".join(state.pumping_modes))
@@ -158,7 +158,7 @@ class ChibioStation(Station):
             )  # fmt: skip
 
     def _start(self) -> Task:
-        """Task: start the experiment; the state is read before every try, because a second start stops it."""
+        """Task: start the experiment; read the state before every try, because a second start stops the experiment."""
         for _ in range(STARTS):
             if self.connection.read().running:
                 return
@@ -171,7 +171,7 @@ class ChibioStation(Station):
             raise messages.DoesNotStart(reactor=self.name)
 
     def _recover(self, kind: str) -> Task:
-        """Task: switch pumps off and start the experiment again, after a stop if its thread is dead; tell a failure."""
+        """Task: switch the pumps off and start the experiment again; stop it first if its thread is dead."""
         self._restarts += 1
         if self._restarts > 1:
             self.book.tell(messages.RestartedAgain(attempt=self._restarts))
@@ -182,7 +182,7 @@ class ChibioStation(Station):
                 self.connection.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
             elif kind == "restarted":
-                self.sampling.key = None  # the device's records begin anew: any sample is a new one
+                self.sampling.key = None  # the device's records begin anew, so any sample is new
                 self.doses.acted = None
             yield from self.bring_up(waited=kind != "stopped")
             self.book.tell(messages.RestartedAfter(kind=kind))
@@ -191,10 +191,10 @@ class ChibioStation(Station):
             self.book.tell(messages.NotRestarted(kind=kind, error=error))
         finally:
             self.busy = False
-            self.sampling.arrived_s = self._clock.now()  # a further recovery waits its time
+            self.sampling.arrived_s = self._clock.now()  # delays a further recovery
 
     def poll(self) -> bool:
-        """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
+        """Read the reactor; return whether it has a new sample. An error becomes the logbook's fault."""
         self.sampling.next_look = self._clock.now() + self._config.retry_s
         try:
             if not self.restored:
@@ -206,7 +206,7 @@ class ChibioStation(Station):
             state = self._keep_on(self.connection.read())
         except (LinkError, ProtocolError, DeviceStateError) as error:
             self.book.report(fault_of(error, present=self.connection.state is not None))
-            self.sampling.not_taken(is_new=True)  # one may have appeared unseen
+            self.sampling.not_taken(is_new=True)  # a sample may have appeared unseen
             return False
         return False if self.busy else self._judge(state)
 
@@ -218,7 +218,7 @@ class ChibioStation(Station):
         self.doses.watch(state, ours=not self.handed_over)
         self._unspoil(state)
         is_new = self.sampling.look(state, now)
-        if is_new and now < self.doses.stray_s + FIRST_SAMPLE_S:  # measured before or after that, nobody knows
+        if is_new and now < self.doses.stray_s + FIRST_SAMPLE_S:  # measured before or after it: unknown
             self.sampling.key, self.sampling.arrived_s, is_new = (state.sample_s, state.cycles), now, False
         age = 0.0 if is_new else now - self.sampling.arrived_s
         fault = diagnose(
@@ -228,7 +228,7 @@ class ChibioStation(Station):
         )  # fmt: skip
         self.book.report(fault)
         if state.running and not self.doses.running:
-            self.doses.escalated, self._ended = False, ""  # from here on a stop is somebody else's
+            self.doses.escalated, self._ended = False, ""  # a later stop is by somebody else
         if fault is not None and self._config.recover and now >= self._again_s and self._recoverable(fault.kind, age):
             self.busy = True
             self._agenda.add(self._recover(fault.kind))
@@ -239,7 +239,7 @@ class ChibioStation(Station):
         return False
 
     def _held(self, now: float) -> bool:
-        """Whether a new sample waits a little, because what the dose before it gave is about to be known."""
+        """Whether a new sample must wait, because the volume of the last dose will soon be known."""
         if not self.doses.unsettled:
             self._held_s = math.nan
             return False
@@ -252,7 +252,7 @@ class ChibioStation(Station):
         return kind == "restarted" or own_stop or (kind == "stalled" and age_s > self._config.lost_s)
 
     def _why_ended(self) -> str:
-        """Why this program ended the experiment, "" if it did not, or if it runs again."""
+        """Return why this program ended the experiment; "" if it did not, or if the experiment runs again."""
         return (self.doses.stuck or "its pumps could not be verified off") if self.doses.escalated else self._ended
 
     def _take(self, state: DeviceState, now: float) -> None:
@@ -271,7 +271,7 @@ class ChibioStation(Station):
         self._put_targets_right(state)
 
     def _put_targets_right(self, state: DeviceState) -> None:
-        """Heating and stirring as this run wants them: a quick restart loses them silently, a web page changes them."""
+        """Restore heating and stirring: a quick restart loses them silently, and a web page can change them."""
         connection, stir = self.connection, self._config.stir
         targets = (("Thermostat", state.temperature_target, self._target_c), ("Stir", state.stir_target, stir))
         for item, value, wanted in targets:
@@ -282,7 +282,7 @@ class ChibioStation(Station):
                 self._mend("off", "switched on again", connection.switch, item, True)
 
     def _unspoil(self, state: DeviceState) -> None:
-        """Set a pump's target to a number again, before the device works with it; tell where it has."""
+        """Replace a pump target of nan by 0 before the device uses it; report any nan that it has used."""
         for item in state.spoilt:
             if item in PUMPS and math.isnan(state.pump_targets[PUMPS.index(item)]):
                 self._mend("set to nan by somebody", "set to 0", self.connection.target, item, 0.0)
@@ -311,12 +311,12 @@ class ChibioStation(Station):
         return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal, pump)
 
     def pumps_off(self) -> None:
-        """All pumps but the overflow pump off, verified; a dose is over then. Raises: as `Connection.pumps_off`."""
+        """Switch all pumps but the overflow pump off, verified; this ends a dose. Raises: as `Connection.pumps_off`."""
         self.doses.settle()
         self.doses.drain()
 
     def give_up(self) -> None:
-        """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""
+        """Switch all pumps and the on-board regulation off for the rest of the run, verified. Raises: ReactorError."""
         if self.handed_over:
             self.connection.switch("OD", False)
             self.book.log("regulate", setpoint=None)
@@ -325,7 +325,7 @@ class ChibioStation(Station):
         self.doses.settle()
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation, at most 0.02 of full power; first written down. Raises: as `post`."""
+        """Hand over to the on-board regulation (duty up to 0.02); write to the journal first. Raises: as `post`."""
         connection = self.connection
         connection.pumps_off(pumps=self._config.overflow_pump.others)
         self.book.log("regulate", setpoint=setpoint)
@@ -349,7 +349,7 @@ class ChibioStation(Station):
             self.book.tell(messages.RegulationFoundOn())
 
     def set_temperature(self, target_c: float) -> None:
-        """Thermostat target, degC; nan leaves it. A failure becomes a note, and the next call tries again."""
+        """Set the thermostat target, degC; nan leaves it unchanged. A failure becomes a note; the next call retries."""
         if math.isnan(target_c) or abs(target_c - self._target_c) < 1e-6:
             return
         try:
@@ -366,7 +366,7 @@ class ChibioStation(Station):
         self._blank = raw
 
     def heat_off(self) -> None:
-        """Thermostat and heater off, and not switched on again. Raises: ReactorError."""
+        """Switch thermostat and heater off for the rest of the run. Raises: ReactorError."""
         self._heat = False
         self.connection.switch("Thermostat", False)
         self.connection.switch("Heat", False)
