@@ -74,7 +74,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     for what in content["rejected"]:
         print(f"  rejected rows {what['rows']} ({what['n']}): {what['reason']}")
     print("\n".join(f"  {note}" for note in recording.notes), f"files {environment}, {written}", sep="\n")
-    print(f"next, all of it on one page: python -m experiments.report run={folder}")
+    print(f"next, write all results on one page: python -m experiments.report run={folder}")
     return result.pmse_pct
 
 
