@@ -1,5 +1,4 @@
-"""The closed loop of the program and what it leaves behind: one assembly for simulation, emulator and device.
+"""From a checked config to a run of `deploy`: the same code for simulation, emulator and device.
 
-Entered by deploy through `config` and `run`, by rehearsals through `assemble`, by commands at the
-device through `device`, and by comparison for loop and metrics. Free of torch.
+`run` runs the loop and writes the output files; `assemble` builds the loop, also for tests. Imports no PyTorch.
 """

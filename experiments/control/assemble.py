@@ -1,6 +1,6 @@
-"""From a deploy config to a closed loop: everything that the config names is read here, once, and put together.
+"""From a deploy config to a closed loop: read the files that the config names, and build all objects of the run.
 
-A rehearsal is assembled here too, with a clock and a transport of its own.
+Rehearsals in tests use this module, too, with their own clock and transport.
 """
 
 import logging
@@ -49,17 +49,16 @@ USUAL_VIALS = "nominal_noise"  # preset
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Objects built from a deploy config, part by part; lower layers do not hold the config itself.
+    """Objects built from a deploy config; lower layers receive these, not the config.
 
-    family, backend, bench: of the reactors. scenarios, ends, roles: one per reactor.
-    plant: of the simulated vials, that of a `plant_file` where there is one; with an `env_file` it grows and is fed as
-      calibrated.
-    model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
-    law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
-    policy: as read, None for a preflight. bounds: of its certificate.
-    further: signals that are held beside the density, which have seen nothing yet.
-    fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
-    resumed: whether this run continues an earlier one.
+    family, backend, bench: of the reactors. scenarios, ends, roles: one entry per reactor.
+    plant: simulated vials: from `plant_file` if given, with growth and pump of `env_file` if given.
+    model: growth model for model-based controllers: calibrated if a file is given, else nominal.
+    law: config of the pump rate's controller. wanted: policy that controller=dqn asks for; None for other controllers.
+    policy: the loaded policy; None for a preflight. bounds: from its certificate.
+    further: signals controlled beside the density, new, without readings.
+    fsync: whether each row is forced to disk. title: controller and plant of the run. row: the run's parameters in
+      TensorBoard's HPARAMS table. resumed: whether this run continues an earlier one.
     """
 
     family: Family
@@ -83,13 +82,13 @@ class Setup:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Of the recordings."""
+        """Columns of the recordings."""
         aim = (AIM,) if Progress(self.scenarios).announced else ()
         return (*COLUMNS, *aim, *(column for signal in self.further for column in signal.columns))
 
 
 def completed(config: DeployConfig, folder: Path | None = None) -> DeployConfig:
-    """Fill in what guests complete. Args: as of `Guest.completed`. Raises: UserError."""
+    """Let every guest complete a config. Args as in `Guest.completed`. Raises: UserError."""
     with frame.refusing(ValueError, ReactorError):
         for guest in GUESTS:
             config = guest.completed(config, folder)
@@ -97,9 +96,9 @@ def completed(config: DeployConfig, folder: Path | None = None) -> DeployConfig:
 
 
 def unpack(config: DeployConfig, folder: Path) -> Setup:
-    """Everything that a config names, read and checked; the run folder gets a copy of the policy.
+    """Build the objects of a run from its config; copy the policy into the run folder.
 
-    Raises: UserError naming what cannot be read or does not fit.
+    Raises: UserError for a file that cannot be read and for parts that do not fit together.
     """
     family, backend, safety = family_of(config.backend), config.backend, config.safety
     if config.watch:
@@ -108,7 +107,9 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     with frame.refusing(ValueError):
         scenarios, ends, roles = config.schedules(), config.ends(), config.roles()
     if resumed and not family.can.resume:
-        why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
+        why = (
+            "repeat a simulated run instead" if family.simulated else "its reactors cannot be resumed; start a new run"
+        )
         raise messages.CannotResume(run=config.resume, why=why)
     bench, (plant, model) = config.bench, _models(config)
     volumes_ml = bench.volumes(backend.reactors)
@@ -139,7 +140,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
 
 
 def _models(config: DeployConfig) -> tuple[PlantConfig, EnvConfig]:
-    """Of the simulated vials, and the growth model that model-based controllers are given. Raises: UserError."""
+    """Return the simulated vials, and the growth model for model-based controllers. Raises: UserError."""
     plant, bench = config.plant, config.bench
     model = EnvConfig(tau=bench.tau)
     if config.plant_file is not None:
@@ -153,7 +154,7 @@ def _models(config: DeployConfig) -> tuple[PlantConfig, EnvConfig]:
 
 
 def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], ends: list[str]) -> None:
-    """Whether family, scenario, controller and interlock fit, before a device is asked. Raises: UserError."""
+    """Check, without the device, that family, scenario and controller fit together. Raises: UserError."""
     law, kind = config.controller.kind, config.backend.kind
     if not family.simulated:
         try:
@@ -165,25 +166,27 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
 
 
 def _check_room(bench: Bench, safety: SafetyConfig, above_ml: Array) -> None:
-    """Check that the largest dose may be given at all, by the vial and by the budget of a minute. Raises: UserError.
+    """Check that the vial and the budget per minute allow the largest dose. Raises: UserError.
 
-    Args: above_ml: room of each vial above its tube, mL, (N,).
+    Args: above_ml: free volume of each vial above its waste tube, mL, (N,).
     """
     room_ml = float(np.min(np.minimum(safety.overflow_ml, above_ml)))
     largest_ml, allowed_ml = bench.max_rate * bench.period_s, min(room_ml, safety.ml_a_minute(bench))
     if largest_ml > allowed_ml + 1e-9:
         given = f"bench.max_rate = {bench.max_rate:g} over {bench.period_s:g} s makes one dose of {largest_ml:.3g} mL"
-        allowed = f"{max(allowed_ml, 0.0):.3g} mL (what a vial has room for above its tube, and safety.ml_per_minute)"
+        allowed = (
+            f"{max(allowed_ml, 0.0):.3g} mL (limit: free volume of a vial above its tube, or safety.ml_per_minute)"
+        )
         least = max(np.floor(1e5 * allowed_ml / bench.period_s) / 1e5, 0.0)
-        raise frame.UserError(f"{given}: allowed {allowed}; give bench.max_rate={least:g} or less")
+        raise frame.UserError(f"{given}: allowed {allowed}; use bench.max_rate={least:g} or less")
 
 
 def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dict[str, float | str]]:
-    """Who controls what, in a title and as a row of TensorBoard's table; growth and pump of a simulated vial."""
+    """Return the run's title (controller and plant), and its parameters for TensorBoard's HPARAMS table."""
     chosen, decides, controlled = choices(folder), str(config.controller.kind), str(config.backend.kind)
     if family.simulated:
         controlled = "plant_file" if config.plant_file else chosen.get("plant", "given")
-        if controlled == USUAL_VIALS:  # which may have been replaced
+        if controlled == USUAL_VIALS:  # a guest may have replaced them
             controlled = next(filter(None, (guest.vials(config) for guest in GUESTS)), controlled)
     law = "".join(f" and {kind}" for guest in GUESTS for _, kind in guest.deciders(config))
     row: dict[str, float | str] = {"command": "deploy", "decides": decides, "on": controlled}
@@ -196,7 +199,7 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
-    """Build the signals held beside the density. Raises: UserError where scenario, backend and they do not fit."""
+    """Build the signals controlled beside the density. Raises: UserError if scenario or backend does not fit them."""
     with frame.refusing(ValueError, ReactorError):
         family, made = family_of(config.backend), []
         for guest in GUESTS:
@@ -213,10 +216,10 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
-    """Laws, interlock and scenarios around reactors that are ready; a resumed loop stands where it was.
+    """Build the closed loop of opened reactors; a resumed loop continues in its saved state.
 
-    Raises: UserError naming what the controller needs and does not have here; RecordingError for a state that is
-      damaged or does not fit.
+    Raises: UserError if the controller needs something that this run does not have; RecordingError if the saved state
+      is damaged or does not fit.
     """
     (plant, flow), volumes_ml = setup.family.truth(reactors), setup.bench.volumes(reactors.names)
     with frame.refusing(ValueError):
@@ -228,7 +231,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     kind = WatchedInterlock if isinstance(setup.family, WatchedFamily) else Interlock
     interlock = kind(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
-    scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
+    scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # the model has one volume
     loop = ClosedLoop(
         reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale,
         setup.family.actuators(setup.backend), setup.model,
@@ -242,21 +245,21 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
 
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
-    """Open the loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
+    """Open the reactors, yield their closed loop, and release them afterwards. Raises: ReactorError, UserError."""
     if setup.resumed and is_over(record.journal, record.state_path):
-        remedy = "nothing was done to the device; start a new run"
-        raise frame.UserError(f"resume={record.folder}: the run is over, its pumps were verified off; {remedy}")
+        remedy = "no command was sent to a device; start a new run"
+        raise frame.UserError(f"resume={record.folder}: the run has ended with all pumps verified off; {remedy}")
     opening = Opening(setup.backend, setup.bench, setup.plant, record.journal, record.folder, setup.resumed)
     with setup.family.open(opening) as reactors:
         try:
             yield close_loop(setup, reactors, record)
-        except BaseException:  # before the loop, which ends with the same by itself: an overflow pump runs already
+        except BaseException:  # an error before the loop starts: an overflow pump may already run
             reactors.stop()
             raise
 
 
 def run_preflight(setup: Setup, folder: Path) -> None:
-    """`preflight_only=true`: every check a line with pass or the remedy. Raises: UserError if one failed."""
+    """Run the checks of `preflight_only=true`; print each with pass or remedy. Raises: UserError if one fails."""
     if setup.family.simulated:
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
     policy = [] if setup.wanted is None else [policy_check(setup.wanted)]

@@ -1,4 +1,4 @@
-"""What a guest may do to a run that is put together: complete its config, hold signals, and tell of both."""
+"""Interface by which a guest package takes part in a run: complete the config, add signals, describe both."""
 
 from pathlib import Path
 
@@ -9,31 +9,31 @@ from experiments.loop.signals import Signal
 
 
 class Guest:
-    """One that adds nothing; every part may be left as it is."""
+    """Base class of guests. It adds nothing to a run; a guest overrides the methods that it needs."""
 
     def completed(self, config: DeployConfig, folder: Path | None) -> DeployConfig:
-        """Fill in what the config leaves open. Args: folder: of the run, which may keep files; None for a dry run.
+        """Return the config with missing parts filled in. Args: folder: run folder for files; None for a dry run.
 
-        Raises: ValueError, ReactorError or UserError for what does not fit.
+        Raises: ValueError, ReactorError or UserError if parts of the config do not fit together.
         """
         return config
 
     def signals(
         self, config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]
     ) -> list[Signal]:
-        """Build signals that are held beside the density. Args: scenarios: one per reactor. Raises: as `completed`."""
+        """Build the guest's signals, controlled beside density. Args: scenarios: one per reactor. Raises: as above."""
         return []
 
     def vials(self, config: DeployConfig) -> str:
-        """Name the preset that it put in the place of the usual vials; "" for none."""
+        """Return the plant preset by which `completed` replaced the usual vials; "" for none."""
         return ""
 
     def deciders(self, config: DeployConfig) -> list[tuple[str, str]]:
-        """List what decides beside the controller: of what, and its name."""
+        """List the guest's controllers: (controlled quantity, kind of its controller)."""
         return []
 
     def asked(self, scenario: Scenario, phase: int) -> str:
-        """Tell what a phase asks for beside density and temperature, for the timetable; "" for nothing."""
+        """Return the guest's setpoints in a phase as text for the timetable; "" for none."""
         return ""
 
 
@@ -41,5 +41,5 @@ GUESTS: list[Guest] = []
 
 
 def add(guest: Guest) -> None:
-    """Let a guest take part in every run."""
+    """Register a guest; it then takes part in every run."""
     GUESTS.append(guest)

@@ -1,8 +1,8 @@
-"""Tell somebody: a line of JSON to a command or an HTTP address at the start, at alarms, hand-overs and at the end.
+"""Notification: a line of JSON to a command or an HTTP address at start, alarm, hand-over and end of a run.
 
-Telling never stands in the way of a dose: messages wait in a short queue for a thread of their own, each try has a
-time limit, and what does not fit into the queue is dropped and counted. An address is a secret, because many services
-know their user by it: it is only ever in the environment, and what is logged of it is scheme and host.
+Notification never delays a dose: a separate thread sends the messages from a short queue, each try has a time limit,
+and messages that do not fit into the queue are dropped and counted. An address is a secret, because many services
+identify their user by it: it is kept only in the environment, and the log shows only its scheme and host.
 """
 
 import json
@@ -25,13 +25,13 @@ from experiments.control import messages
 
 log = logging.getLogger(__name__)
 
-HOOK = "DEPLOY_HOOK"  # variable in which an address of the command line goes on
-LIMIT_S, LAST_S, WAITING = 10.0, 3.0, 32  # for one try; for what is left at the end; messages that may wait
+HOOK = "DEPLOY_HOOK"  # environment variable that receives an address from the command line
+LIMIT_S, LAST_S, WAITING = 10.0, 3.0, 32  # time limit of a try; time to send the rest at the end; length of the queue
 ADDRESS = ("http://", "https://")
 
 
 def hidden(arguments: Sequence[str], environment: MutableMapping[str, str]) -> list[str]:
-    """Move the address of `notify=https://...` into the environment: `notify=env:DEPLOY_HOOK`."""
+    """Move the address of `notify=https://...` into the environment; return arguments with notify=env:DEPLOY_HOOK."""
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -44,11 +44,11 @@ def hidden(arguments: Sequence[str], environment: MutableMapping[str, str]) -> l
 
 
 class Hook:
-    """Where messages go: a command that reads one from its standard input, or an address that is sent it by POST.
+    """Receiver of messages: a command, started for each message with it on standard input, or an address (HTTP POST).
 
-    Args: target: command line or address. limit_s: for one try.
-    Attributes: name, as it may be logged.
-    Raises: UserError for a command line that cannot be read, or an address without a host.
+    Args: target: command line or address. limit_s: time limit of one try.
+    Attributes: name: the receiver in the log, without secrets.
+    Raises: UserError for an invalid command line, an unknown command, or an address without a host.
     """
 
     def __init__(self, target: str, limit_s: float = LIMIT_S) -> None:
@@ -71,10 +71,10 @@ class Hook:
         self.name = Path(self._command[0]).name
 
     def send(self, line: bytes) -> str:
-        """Deliver one line; what went wrong in a few words that name no secret, "" if nothing did."""
+        """Send one line; return the reason of a failure, without secrets, or ""."""
         try:
             return self._post(line) if self._by_http else self._run(line)
-        except Exception as error:  # whatever it is, it is the hook's and not the run's
+        except Exception as error:  # no error of the receiver may end the run
             return type(error).__name__
 
     def _post(self, line: bytes) -> str:
@@ -93,7 +93,7 @@ class Hook:
         return f"exit status {self._child.returncode}" if self._child.returncode else ""
 
     def give_up(self) -> None:
-        """End a command that has not ended by itself, with what it started."""
+        """Kill a command that is still running, and all its child processes."""
         if self._child is not None and self._child.poll() is None:
             with suppress(ProcessLookupError):
                 os.killpg(self._child.pid, signal.SIGKILL)
@@ -102,10 +102,10 @@ class Hook:
 
 
 class Notifier:
-    """Messages of one run. Calling it never waits, never raises.
+    """Sender of a run's messages. Call it to queue a message; a call never waits and never raises.
 
-    Args: hook: None drops every message. run: folder of the run.
-    Attributes: sent, failed, dropped: how many messages.
+    Args: hook: receiver; None: no message is sent. run: run folder.
+    Attributes: sent, failed, dropped: numbers of messages.
     """
 
     def __init__(self, hook: Hook | None, run: Path) -> None:
@@ -115,11 +115,11 @@ class Notifier:
 
     @property
     def dropped(self) -> int:
-        """Messages that found no room."""
+        """Number of messages that did not fit into the queue."""
         return 0 if self._outlet is None else self._outlet.dropped
 
     def __call__(self, event: str, text: str, reactor: str = "") -> None:
-        """Queue a message. Args: event: start, alarm, hand_over, policy or end. reactor: "" for all."""
+        """Queue a message. Args: event: start, alarm, hand_over, policy or end. reactor: its name, "" for all."""
         if self._outlet is None:
             return
         at = datetime.now().astimezone().isoformat(timespec="seconds")
@@ -135,7 +135,7 @@ class Notifier:
             log.warning(messages.HookFailed(hook=hook.name, why=problem))
 
     def close(self) -> None:
-        """Wait a few seconds for what is still queued, then give it up; say how many messages arrived. Idempotent."""
+        """Wait a few seconds for queued messages, discard the rest, and log the counts. Idempotent."""
         if self._outlet is None or self._hook is None:
             return
         left, dropped = self._outlet.close(LAST_S), self.dropped
@@ -146,10 +146,10 @@ class Notifier:
 
 
 def opened(target: str, run: Path, resumed: bool) -> Notifier:
-    """Open the notifier of a config's `notify`.
+    """Open the notifier that a config's `notify` names.
 
-    Raises: UserError for a variable that is not set, unless the run is resumed: a culture waits for that, so it goes
-      on untold and says so.
+    Raises: UserError for an unusable receiver. A resumed run only logs this and continues without messages, because a
+      culture waits for it.
     """
     try:
         if target.startswith("env:"):

@@ -1,4 +1,4 @@
-"""The policy file of a run: finding it, checking it, judging whether it may run, and keeping a copy with the run."""
+"""Policy file of a run: find it, check it, decide whether it may run, and copy it into the run folder."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,9 +27,9 @@ from hardware.storage import atomic
 log = logging.getLogger(__name__)
 
 SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
-TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
-POOR_REGRET_PCT = 10.0  # above which a run warns; the worst of 32 seeds of agent=paper has 11
-FORCE = "force_policy=true runs it all the same"
+TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # in runs/; other folders contain only copies
+POOR_REGRET_PCT = 10.0  # a higher regret gives a warning; the worst of 32 seeds of agent=paper has 11
+FORCE = "to run it nevertheless, add force_policy=true"
 
 
 class NoPolicyError(frame.UserError):
@@ -38,12 +38,12 @@ class NoPolicyError(frame.UserError):
 
 @dataclass(frozen=True)
 class WantedPolicy:
-    """The policy that a run is to have, and what that run asks of it.
+    """Policy that a run asks for, and the conditions of the run.
 
-    name: as of `find_policy`. bench: with the control period and the largest pump rate that the interlock allows.
-    model: tau, control period and largest pump rate that laws are given. estimator: settings of the policy's estimator
-    that are changed. setpoints: OD. at_stake: a culture is: a policy whose certificate does not say that it is safe
-    is refused. forced: it is not refused.
+    name: as in `find_policy`. bench: control period and largest pump rate that the interlock allows. model: growth
+    model of the run. estimator: changed settings of the policy's estimator. setpoints: of the scenario, OD.
+    at_stake: whether the run has a real culture, so that a policy without a safety proof is refused. forced: whether
+    the user permits such a policy.
     """
 
     name: str
@@ -62,10 +62,10 @@ class WantedPolicy:
 
 @dataclass(frozen=True)
 class Training:
-    """Training data of a policy file; nan where missing.
+    """Facts about the training of a policy, from its file; nan where missing.
 
-    control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
-    setpoints: lowest and highest one, OD. relative: it serves any control period and setpoint.
+    control_min: control period, min. regret_pct: regret, %. updates: number of gradient steps.
+    setpoints: lowest and highest setpoint, OD. relative: whether it works with any control period and setpoint.
     """
 
     control_min: float
@@ -76,7 +76,7 @@ class Training:
 
     @classmethod
     def of(cls, policy: Policy) -> "Training":
-        """Read from the metadata. Raises: TypeError, ValueError, AttributeError, KeyError for damaged ones."""
+        """Read the metadata of a policy. Raises: TypeError, ValueError, AttributeError, KeyError if damaged."""
         control, regret, updates = (
             float(policy.metadata.get(key, np.nan)) for key in ("control_min", "regret_pct", "updates")
         )
@@ -85,15 +85,15 @@ class Training:
         return cls(control, regret, updates, limits, policy.observation == policies.RELATIVE)
 
     def doubts(self, setpoints: Sequence[float]) -> list[str]:
-        """List reasons against this training, each with its remedy; a value missing from the file gives no reason."""
+        """List reasons not to use the policy, each with its remedy. A value missing from the file gives no reason."""
         low, high = self.setpoints
         outside = sorted({s for s in setpoints if s < low - 1e-9 or s > high + 1e-9})
         reasons = {
             "it was exported before the first update (train for more steps than agent.learn_start)": self.updates == 0,
             f"its regret is {self.regret_pct:.0f} %, more than {POOR_REGRET_PCT:g} % "
             "(train longer or with another seed)": self.regret_pct > POOR_REGRET_PCT,
-            f"it was trained for setpoints {low:g} to {high:g}, the scenario asks for "
-            f"{', '.join(f'{s:g}' for s in outside)} (train with env.setpoints that reach there)": bool(outside),
+            f"it was trained for setpoints {low:g} to {high:g}, but the scenario has "
+            f"{', '.join(f'{s:g}' for s in outside)} (train with env.setpoints that include them)": bool(outside),
         }
         return [reason for reason, holds in reasons.items() if holds]
 
@@ -107,9 +107,9 @@ class Training:
 
 
 def find_policy(name: str) -> Path:
-    """Find a policy.npz by path, run folder, `shipped`, or `latest`: what `train` or `demo` wrote last.
+    """Find a policy.npz. Args: name: path, run folder, `shipped`, or `latest` (newest policy of `train` or `demo`).
 
-    Raises: UserError saying what to give instead.
+    Raises: UserError with allowed values.
     """
     if not name.strip():
         raise messages.NoPolicyNamed()
@@ -126,21 +126,21 @@ def find_policy(name: str) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Read a policy in this context. Raises: UserError naming the file and what is wrong with it."""
+    """Turn errors of reading a policy file in this context into a UserError with the file and the reason."""
     try:
         yield
     except policies.PolicyError as error:
         raise frame.UserError(str(error)) from None
-    except Exception as error:  # whatever a damaged file makes NumPy say
+    except Exception as error:  # NumPy raises many kinds of error for a damaged file
         why = (str(error).splitlines() or [type(error).__name__])[0]
         raise messages.PolicyDamaged(path=path, why=why) from None
 
 
 def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
-    """Load the policy that `find_policy` finds, checked against control period and interlock.
+    """Load a policy, and check that it fits the control period and the interlock.
 
-    Args: control_min: of the backend, min. max_rate: largest pump rate that the interlock allows, mL/s.
-    Raises: UserError naming the file and, for a mismatch, both values.
+    Args: name: as in `find_policy`. control_min: control period, min. max_rate: largest allowed pump rate, mL/s.
+    Raises: UserError with the file and, for a mismatch, both values.
     """
     path = find_policy(name)
     with readable(path):
@@ -149,7 +149,7 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         fastest = 0.0 if training.relative else float(policy.actions.max())
     if policy.observation not in (policies.ABSOLUTE, policies.RELATIVE):
         seen = ", ".join(policy.observation)
-        raise frame.UserError(f"policy {path} observes {seen}; give a policy of env=sim or env=relative")
+        raise frame.UserError(f"policy {path} has inputs {seen}; give a policy trained with env=sim or env=relative")
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
         raise messages.OtherPeriod(path=path, own_min=training.control_min, asked_min=control_min)
     if not fastest <= max_rate + 1e-12:
@@ -159,10 +159,10 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
 
 
 def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> None:
-    """Refuse a policy that is not proven to be safe for this run, and warn of all else that speaks against it.
+    """Refuse a policy that is not proven safe for this run; log every other reason against it as a warning.
 
-    Args: file: of the policy, beside which its certificate lies.
-    Raises: UserError where a culture is at stake, unless it is forced or the resumed run began with it.
+    Args: file: file of the policy; its certificate is beside it. resumed: a resumed run keeps its policy.
+    Raises: UserError for an unsafe policy if a culture is at stake, unless the policy is forced or the run resumed.
     """
     found = _judged(policy, file, wanted)
     if found.refused and not resumed and wanted.refuses:
@@ -172,7 +172,7 @@ def admit(policy: Policy, file: Path, wanted: WantedPolicy, resumed: bool) -> No
 
 
 def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:
-    """Judge a policy by its certificate where a culture is at stake; a weak training gives a warning only."""
+    """Return reasons against a policy: from its certificate if a culture is at stake, and from its training."""
     training = Training.of(policy).doubts(wanted.setpoints)
     if not wanted.at_stake:
         return Opinion(short=training)
@@ -184,9 +184,9 @@ def _judged(policy: Policy, file: Path, wanted: WantedPolicy) -> Opinion:
 
 
 def policy_check(wanted: WantedPolicy) -> Check:
-    """Return the policy's line of a preflight. A policy that falls short only in performance passes, with its numbers.
+    """Return the preflight's check of the policy. A policy that is safe but performs poorly passes, with a note.
 
-    That no policy has been trained yet does not stop a look at the device.
+    If no policy has been trained yet, this check fails but the preflight does not.
     """
     try:
         path = find_policy(wanted.name)
@@ -199,16 +199,16 @@ def policy_check(wanted: WantedPolicy) -> Check:
     told = "; ".join(found.refused + found.short)
     if not found.refused:
         said = str(Training.of(policy))
-        safe = f"{said}, proven to be safe" if wanted.at_stake else said
+        safe = f"{said}, proven safe" if wanted.at_stake else said
         return Check("policy", True, f"{safe}; {told}" if told else safe)
     remedy = FORCE if wanted.refuses else "a device refuses it without force_policy=true"
     return Check("policy", False, told, remedy, wanted.refuses)
 
 
 def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> tuple[Policy, EstimateBounds | None]:
-    """Load the policy of a run and its bounds; the run folder keeps a copy with its certificate, for a resumed run.
+    """Load the policy of a run and its bounds, and copy policy and certificate into the run folder.
 
-    The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.
+    A resumed run loads this copy. It is written from the loaded policy, so a training that ends now has no effect.
     Raises: UserError as `load_policy` and `admit`, and if the copy cannot be written.
     """
     kept = folder / "policy.npz"
@@ -222,17 +222,17 @@ def run_policy(wanted: WantedPolicy, folder: Path, resumed: bool) -> tuple[Polic
 
 
 def bounds_of(policy: Policy, changes: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
-    """Read the bounds of a policy's certificate. Args: changes: of its estimator. Raises: UserError for a wrong one."""
+    """Read the bounds in a policy's certificate. Args: changes: estimator settings that differ. Raises: UserError."""
     with frame.refusing(ValueError):
         own = settings(policy, changes)
     return certificate.bounds(policy, own, file, model)
 
 
 def keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
-    """Write the copy of a policy, and of its certificate `proof` where there is one. Raises: UserError."""
+    """Write a policy to the file `kept`, with a copy of its certificate `proof`, if it exists. Raises: UserError."""
     try:
         policies.save(kept, policy)
         if proof is not None and proof.is_file():
             atomic.write(certificate.beside(kept), proof.read_text(encoding="utf-8"), fsync=False)
     except OSError as error:
-        raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
+        raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free disk space") from None

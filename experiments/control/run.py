@@ -1,4 +1,4 @@
-"""One run at the console: the loop until its end or trouble, the pumps verified off, figure and summary."""
+"""Run of `deploy`: the loop to its end or an error, pumps verified off, figure and summary."""
 
 import logging
 import os
@@ -32,16 +32,16 @@ log = logging.getLogger(__name__)
 
 
 class BenchMarks:
-    """The levels and shares that were marked in a run's folder, each taken over once, also over a resume."""
+    """Measurements that users enter with `mark` during a run: each is passed to the loop once, also after a resume."""
 
     def __init__(self, record: Record) -> None:
         self._record, self._size = record, -1
         self._taken = sum(row["kind"] in ("level", "share", "bottle") for row in record.journal.rows)
 
     def take(self, loop: ClosedLoop) -> None:
-        """Tell the loop what was marked since the last call; a damaged file of marks is only reported.
+        """Pass the measurements entered since the last call to the loop. A damaged file gives only a warning.
 
-        Raises: RecordingError of the journal.
+        Raises: RecordingError if the journal cannot be written.
         """
         path = self._record.folder / NAME
         size = path.stat().st_size if path.is_file() else -1
@@ -82,7 +82,7 @@ class BenchMarks:
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
-    """Run the loop until its end or trouble; return the outcome. Pumps are verified off, whatever happens."""
+    """Run the loop to its end or an error, then verify all pumps off in any case; return the outcome."""
     log_changes, marks, reactors = ChangeLog(loop, tell), BenchMarks(record), loop.reactors
     outcome = "failed: see the log"
     record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid(), "boot": boot()})
@@ -100,8 +100,8 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
         outcome = "stopped by the operator"
     except ReactorError as error:
         outcome = f"failed: {error}"
-    except Exception as error:  # whatever it is, what was recorded is worth a summary
-        log.exception("the run ends")
+    except Exception as error:  # after any error the recorded part still needs a summary
+        log.exception("the run ends because of an error")
         outcome = f"failed: {type(error).__name__}: {error}"
     finally:
         try:
@@ -110,16 +110,16 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
             if isinstance(reactors, Watched):
                 log.info(messages.OnlyWatched())
             else:
-                log.info(messages.PumpsOff(left=f"; {left}: left to the on-board regulation" if left else ""))
+                log.info(messages.PumpsOff(left=f"; {left}: regulated by the device itself" if left else ""))
         except ReactorError as error:
             outcome = f"failed: {error}"
     return outcome
 
 
 def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
-    """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
+    """Write figures and summary.json after any outcome; return the outcome, "failed" if they cannot be written."""
     folder = record.folder
-    try:  # a signal or an error in a dose ends the loop before its row is written; the last dose may be repeated
+    try:  # if a signal or an error ended the loop during a dose, the row of that sample is still missing
         record.complete()
     except (RecordingError, OSError) as error:
         log.warning("%s", error)
@@ -142,14 +142,14 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
     for name, rows in zip(record.names, record.rows, strict=True):
         if line := reasons_line(rows):
             log.warning(AlarmsTold(reactor=name, kinds=line))
-    log.info("windows; settled: until |e| stays within 5 %%\n%s", windows_table(summary["windows"]))
+    log.info("windows; settled: time until |e| stays within 5 %%\n%s", windows_table(summary["windows"]))
     log.info("recordings %s; figure %s", folder / "recordings", summary["figure"])
-    log.info("next, all of it on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
+    log.info("next, write all results on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
     return outcome
 
 
 def deploy(config: DeployConfig, folder: Path) -> None:
-    """One closed loop over the scenario."""
+    """Run the closed loop of a config over its scenario, and write its output files. Raises: UserError."""
     outlet.detach()
     if (whole := assemble.completed(config, folder)) != config:
         config = whole
@@ -170,7 +170,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     if outcome.startswith("failed"):
         raise frame.UserError(outcome)
     if outcome == "stopped by the operator" and swept():
-        raise KeyboardInterrupt  # the job is not done, and its sweep ends, too
+        raise KeyboardInterrupt  # the operator also ends the sweep that this job belongs to
 
 
 def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
@@ -180,7 +180,7 @@ def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
         for repair in record.repairs:
             log.warning("%s", repair)
         longest, title = max(s.total_min for s in setup.scenarios), f"{setup.title}, {', '.join(kept[0])}"
-        log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
+        log.info("%s: schedule of %g min (%.1f h), after the culture has grown", title, longest, longest / 60.0)
         log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
         with assemble.opened(setup, record) as loop:
             tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")

@@ -1,4 +1,4 @@
-"""What a run would do: steps by the clock, expected medium, who would decide, where it would record."""
+"""Timetable of a dry run: steps with their times, expected medium, controllers, device and output folder."""
 
 import math
 import tempfile
@@ -20,7 +20,7 @@ HEAD = f"  {'step':>8} {'from':>12} {'to':>12} {'min':>7} {'at most':>8} {'OD':>
 
 @dataclass(frozen=True)
 class Expected:
-    """Of one step: minutes it takes, mL it needs, the OD it ends at, and mL if it takes its longest."""
+    """Expected course of a step. minutes: duration. ml: medium. od: at its end. longest_ml: if it takes its longest."""
 
     minutes: float
     ml: float
@@ -29,19 +29,19 @@ class Expected:
 
 
 def _reaches(od: float, level: float, growth: float, dilution: float) -> float:
-    """Minutes until a culture of OD `od` grows undiluted to `level`, or is diluted at full rate down to it."""
+    """Return the minutes that undiluted growth up, or full dilution down, takes from OD `od` to `level`; inf: never."""
     rate = growth if level > od else dilution - growth
     return 0.0 if level == od else math.log(max(level, od) / min(level, od)) / rate if rate > 0.0 else math.inf
 
 
 def _fed_ml(minutes: float, reached: float, down: bool, growth: float, dilution: float, volume_ml: float) -> float:
-    """Sum the mL that `minutes` need: full rate on the way down, none on the way up, then as much as grows."""
+    """Return the medium that a step of `minutes` needs, mL: full dilution down or no dose up, then growth balanced."""
     held = max(minutes - reached, 0.0) * growth
     return volume_ml * (held + (min(minutes, reached) * dilution if down else 0.0))
 
 
 def expected(s: Scenario, k: int, od: float, growth: float, dilution: float, volume_ml: float) -> Expected:
-    """Step k of a scenario from OD `od`: undiluted growth or full dilution to the setpoint, then growth is balanced.
+    """Predict step k of a scenario from OD `od`: undiluted growth or full dilution to the setpoint, then constant OD.
 
     Args: growth, dilution: growth rate and largest dilution rate, 1/min. volume_ml: of the culture.
     """
@@ -55,7 +55,7 @@ def expected(s: Scenario, k: int, od: float, growth: float, dilution: float, vol
 
 
 def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reached: float) -> float:
-    """Minutes after which the condition of step k is expected to be met; inf where it is not."""
+    """Return the minutes after which the condition that ends step k is expected to hold; inf: never."""
     text, setpoint = (s.until[k] if s.until else None), s.setpoints[k]
     if text == "settled":
         edge = setpoint * (1.0 + math.copysign(s.settled_band, od - setpoint))
@@ -63,7 +63,7 @@ def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reache
         return s.settled_min + (0.0 if inside else _reaches(od, edge, growth, dilution))
     least, most = bounds(text)
     if od >= least or od <= most:
-        return 1.0  # a step lasts a control period at least
+        return 1.0  # a step lasts at least one control period
     for level, passed in ((least, od < least <= setpoint), (most, od > most >= setpoint)):
         if passed:
             return min(_reaches(od, level, growth, dilution), reached)
@@ -71,19 +71,19 @@ def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reache
 
 
 def timetable(config: DeployConfig, place: str, now: datetime) -> str:
-    """Everything that `dry_run=true` prints; reads files, asks no device and writes nothing.
+    """Return the text that `dry_run=true` prints. It reads files, contacts no device and writes nothing.
 
-    Args: place: where the run would record. now: when it would start.
-    Raises: UserError as the run itself would, for all that can be known without a device.
+    Args: place: output folder of the run. now: time at which the run would start.
+    Raises: UserError for every error of the run that can be found without a device.
     """
     if config.resume is not None:
-        raise frame.UserError("dry_run=true: a resumed run goes on where it was; drop dry_run or resume")
+        raise frame.UserError("dry_run=true: a resumed run has no timetable; remove dry_run or resume")
     with tempfile.TemporaryDirectory() as scratch:
         setup = assemble.unpack(whole := assemble.completed(config), Path(scratch))
     lines = [_deciders(whole, setup), *_device(setup)]
     for name, role, scenario in zip(setup.backend.reactors, setup.roles, setup.scenarios, strict=True):
         lines += _reactor(setup, name, role, scenario, now)
-    return "\n".join([*lines, f"would record in {place}; nothing was asked of a device and nothing was written"])
+    return "\n".join([*lines, f"would write to {place}; no device was contacted and no file written"])
 
 
 def _deciders(c: DeployConfig, setup: Setup) -> str:
@@ -105,7 +105,7 @@ def _device(setup: Setup) -> Iterator[str]:
 
 
 def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: datetime) -> Iterator[str]:
-    """List the steps of one reactor, each in a line, and whether its medium lasts."""
+    """Yield the lines of one reactor: its steps, and whether the medium is sufficient."""
     growth, volume_ml = setup.model.mu, setup.bench.volume_of(name)
     dilution = setup.model.max_pump_rate / setup.model.tau * (setup.bench.volume_ml / volume_ml)
     known = max(setup.family.start_od(setup.backend, setup.plant), scenario.recovery_od)
@@ -113,7 +113,7 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
     yield f"{name} ({role}), from OD {od:g}, growth {growth:g} 1/min"
     yield HEAD
     if scenario.recovery_od:
-        longest = f"at most {scenario.recovery_limit_min:g} min; the times below count from its end"
+        longest = f"at most {scenario.recovery_limit_min:g} min; the times below assume that it takes no time"
         beyond = "" if scenario.recovery == "grow" else "beyond and is diluted to "
         yield f"  {'recovery':>8} grows undiluted {beyond or 'to '}OD {scenario.recovery_od:g}, {longest}"
     for k, (setpoint, most_min, degc) in enumerate(
@@ -129,7 +129,7 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
         if longest_spare := _spare(scenario, k, most_min):
             given = ", ".join(f"at most {spare:.1f} mL by Pump{pump}" for pump, spare in longest_spare.items())
             yield f"  {'':>8} gives {scenario.outputs[k]}: {given}"
-        # What a spare pump gives dilutes as feed does, which is then left out.
+        # The volume of a spare pump also dilutes the culture; the feed is reduced by this volume.
         ml += max(step.ml, sum(_spare(scenario, k, step.minutes).values()))
         most += max(step.longest_ml, sum(longest_spare.values()))
         at, od = at + step.minutes, step.od
@@ -137,7 +137,7 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
 
 
 def _spare(scenario: Scenario, k: int, minutes: float) -> dict[int, float]:
-    """Sum what each spare pump gives in so many minutes of a step, mL."""
+    """Return pump -> volume, mL, that each spare pump delivers in `minutes` of a step."""
     outputs = outputs_of(scenario.outputs[k]) if scenario.outputs else ()
     return {o.pump: o.ml + o.ml_h * minutes / 60.0 for o in outputs}
 
@@ -145,9 +145,9 @@ def _spare(scenario: Scenario, k: int, minutes: float) -> dict[int, float]:
 def _lasts(setup: Setup, ml: float, most: float) -> str:
     limit, key = min((setup.bench.bottle_ml, "bench.bottle_ml"), (setup.safety.ml_per_run, "safety.ml_per_run"))
     if most <= limit:
-        return f"{key}={limit:g} lasts"
-    word = "does NOT last" if ml > limit else "may not last"
-    return f"{key}={limit:g} {word}: the interlock stops feeding there; give the run more"
+        return f"{key}={limit:g} is sufficient"
+    word = "is NOT sufficient" if ml > limit else "may not be sufficient"
+    return f"{key}={limit:g} {word}: at this volume the interlock stops feeding; provide more"
 
 
 def _clock(now: datetime, minutes: float) -> str:

@@ -69,7 +69,7 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def refused(path: Path, folder: Path, **changes: Any) -> str:
     """The line with which a device refuses a policy."""
-    with pytest.raises(UserError, match=r"^policy refused: .*; force_policy=true runs it all the same$") as caught:
+    with pytest.raises(UserError, match=r"^policy refused: .*; .*force_policy=true$") as caught:
         unpacked(path, folder, **changes)
     return str(caught.value)
 
@@ -177,8 +177,8 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     source = written(tmp_path / "policy.npz", laws.law())
     wanted = WantedPolicy(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, at_stake=True, forced=False)
     check = policy_check(wanted)
-    assert (check.ok, "performance" in check.detail, "proven to be safe" in check.detail) == (True, False, True)
-    assert "proven to be safe" not in policy_check(replace(wanted, at_stake=False)).detail
+    assert (check.ok, "performance" in check.detail, "proven safe" in check.detail) == (True, False, True)
+    assert "proven safe" not in policy_check(replace(wanted, at_stake=False)).detail
     unpacked(source, tmp_path / "run")
     assert not caplog.messages
     bench = Bench(volume_ml=12.0)

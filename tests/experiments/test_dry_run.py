@@ -66,19 +66,21 @@ def test_steps_clock_and_bottle_are_told() -> None:
     text = told("scenario=hold", "scenario.minutes=[1500]", "bench.bottle_ml=500", "backend.reactors=[M0,M1]")
     assert text.count("Mon 02 12:00 Tue 03 13:00    1500     1500") == 2
     assert text.count("900 mL of medium expected") == 2  # 1500 min x 0.03 1/min x 20 mL
-    assert text.count("bench.bottle_ml=500 does NOT last") == 2
+    assert text.count("bench.bottle_ml=500 is NOT sufficient") == 2
     assert "controller dqn, policy shipped" in text
     budget = told("scenario=hold", "scenario.minutes=[100]", "bench.bottle_ml=500", "safety.ml_per_run=59")
-    assert "safety.ml_per_run=59 does NOT last: the interlock stops feeding there" in budget  # 60 mL expected
-    assert "safety.ml_per_run=61 lasts" in told("scenario=hold", "scenario.minutes=[100]", "safety.ml_per_run=61")
-    assert "would record in HERE" in text
-    assert "bench.bottle_ml=2000 lasts" in told("scenario=hold")
+    assert "safety.ml_per_run=59 is NOT sufficient: " in budget  # 60 mL expected
+    assert "safety.ml_per_run=61 is sufficient" in told(
+        "scenario=hold", "scenario.minutes=[100]", "safety.ml_per_run=61"
+    )
+    assert "would write to HERE" in text
+    assert "bench.bottle_ml=2000 is sufficient" in told("scenario=hold")
     both = told("scenario=hold", "scenario.minutes=[90]", "scenario.outputs=['pump3 2 mL/h, pump4 1.5 mL']")
     assert "at most 3.0 mL by Pump3, at most 1.5 mL by Pump4" in both
     fed = told("scenario=hold", "scenario.minutes=[60]", "scenario.outputs=['pump3 20 mL/h, pump4 20 mL']")
     assert "40 mL of medium expected, 40 mL if" in fed  # more than growth asks for, 36 mL
     longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "bench.bottle_ml=500")
-    assert "may not last" in longer
+    assert "may not be sufficient" in longer
 
 
 def test_each_step_begins_where_the_one_before_it_is_expected_to_end() -> None:
@@ -88,7 +90,7 @@ def test_each_step_begins_where_the_one_before_it_is_expected_to_end() -> None:
     assert [line.split()[3:7:3] for line in text.splitlines() if line.split()[1:2] == ["Mon"]] == [
         ["12:00", "12:23"], ["12:23", "13:53"], ["13:53", "14:38"],
     ]  # fmt: skip
-    assert "the times below count from its end" in text
+    assert "the times below assume that it takes no time" in text
 
 
 def test_each_reactor_is_reckoned_by_its_own_volume_and_the_bench_s_fastest_pump() -> None:
@@ -136,9 +138,9 @@ def test_each_reactor_has_its_own_steps_role_and_bottle() -> None:
     assert steps["M1"] == [
         ["90", "90", "0.70", "30.0", f"{ml[0]:.1f}"], ["30", "30", "0.40", "36.5", f"{ml[1]:.1f}"]
     ]  # fmt: skip
-    assert "36 mL if every step takes its longest; bench.bottle_ml=60 lasts" in of["M0"][-1]
+    assert "36 mL if every step takes its longest; bench.bottle_ml=60 is sufficient" in of["M0"][-1]
     total = f"{sum(ml):.0f} mL of medium expected, {sum(ml):.0f} mL if every step takes its longest"
-    assert f"  {total}; bench.bottle_ml=60 does NOT last" in of["M1"][-2]
+    assert f"  {total}; bench.bottle_ml=60 is NOT sufficient" in of["M1"][-2]
     assert of["M1"][4] == "           gives pump4 2 mL: at most 2.0 mL by Pump4"
     assert not any("gives" in line for line in of["M0"])
 
@@ -151,7 +153,7 @@ def test_a_device_s_culture_is_taken_to_begin_at_its_first_setpoint() -> None:
     assert "M5 (replicate), from OD 0.6, growth" in text
     text = told(*device, "scenario.recovery_od=0.45", "scenario.recovery_limit_min=75")
     assert "from OD 0.45, growth" in text
-    assert "recovery grows undiluted to OD 0.45, at most 75 min; the times below count from its end" in text
+    assert "recovery grows undiluted to OD 0.45, at most 75 min; the times below assume that it takes no time" in text
 
 
 def test_who_would_hold_the_share_is_told() -> None:
@@ -164,7 +166,7 @@ def test_who_would_hold_the_share_is_told() -> None:
 def test_what_the_run_would_refuse_is_refused() -> None:
     with pytest.raises(frame.UserError, match="nowhere"):
         told("policy=nowhere.npz")
-    with pytest.raises(frame.UserError, match="drop dry_run"):
+    with pytest.raises(frame.UserError, match="remove dry_run"):
         timetable(DeployConfig(resume="RUN"), "HERE", NOON)
 
 

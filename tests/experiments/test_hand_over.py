@@ -122,7 +122,7 @@ def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_pat
     monkeypatch.setattr(run.loop, "run", lambda: ())
     with caplog.at_level("INFO"):
         assert control._run(run.loop, run.record, lambda *_: None) == "completed"
-    assert "; M0: left to" in caplog.text
+    assert "; M0: regulated by" in caplog.text
     assert run.data()["OD"]["ON"] == 1
 
 
@@ -274,6 +274,6 @@ def test_a_run_that_is_over_is_not_taken_to_the_device_again_once_its_pumps_were
     record = Record(tmp_path, run.names, setup.fsync, setup.columns)
     tried = ConnectionError("the device was asked")
     monkeypatch.setattr(setup.family, "open", Mock(side_effect=tried))
-    with pytest.raises(frame.UserError if stopped else ConnectionError, match="is over" if stopped else "was asked"):
+    with pytest.raises(frame.UserError if stopped else ConnectionError, match="has ended" if stopped else "was asked"):
         assemble.opened(setup, record).__enter__()
     record.close()

@@ -312,7 +312,7 @@ def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_
         (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence, by which"),
         (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no pump [34] to spare; drop it"),
         (["at_end=regulate"], "at_end = regulate: backend=evolver has no regulation of its own; allowed hold, stop"),
-        (["controller=oracle"], "oracle: knows a simulated plant; allowed with backend=sim only, not backend=evolver"),
+        (["controller=oracle"], "controller=oracle needs the exact state of a simulated plant"),
         (["backend.reactors=[a,b]"], "backend.reactors = .*: allowed 16 different names"),
         (["plant_file=twin.yaml"], "backend.kind = evolver: allowed sim with plant_file"),
     ],
@@ -326,7 +326,7 @@ def test_what_it_cannot_do_is_refused(known: None, tmp_path: Path, given: list[s
 def test_a_culture_is_at_stake(known: None, tmp_path: Path) -> None:
     policies.save(tmp_path / "policy.npz", laws.law())
     poor = ["controller=dqn", f"policy={tmp_path / 'policy.npz'}"]
-    with pytest.raises(frame.UserError, match="policy refused: .*force_policy=true runs it all the same"):
+    with pytest.raises(frame.UserError, match="policy refused: .*force_policy=true"):
         assemble.unpack(main.config(words(AWAY, *poor)), tmp_path)
     assert assemble.unpack(main.config(words(AWAY, *poor, "force_policy=true")), tmp_path).policy is not None
 
@@ -334,7 +334,7 @@ def test_a_culture_is_at_stake(known: None, tmp_path: Path) -> None:
 def test_its_dry_run_says_where_it_is(known: None) -> None:
     text = timetable(main.config(words(AWAY)), "HERE", datetime(2026, 3, 2, 12, 0))
     assert f"backend evolver ({AWAY}), reactors v0, v1" in text
-    assert text.count("bench.bottle_ml=2000 lasts") == VIALS
+    assert text.count("bench.bottle_ml=2000 is sufficient") == VIALS
 
 
 def fed(run: Path) -> np.ndarray[Any, Any]:
