@@ -138,8 +138,8 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (b"", "it has no backend"),
-        (b"[1]\n", "it holds no keys and values"),
+        (b"", "key backend is missing"),
+        (b"[1]\n", "the file has no keys and values"),
         (b"a: [", "in line 1"),
         (b"a: *x\n", "an alias or interpolation in line 1"),
         (b"\xff\xfe\0\1", "no UTF-8 text"),
@@ -156,7 +156,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
         frame._stored(path, "RUN", DeployConfig())
     assert f"{path}: not the config of this run (" in str(caught.value)
     assert why in str(caught.value)
-    assert str(caught.value).endswith("put it back as the run wrote it, or start a new run")
+    assert str(caught.value).endswith("restore the file as the run wrote it, or start a new run")
     assert "\n" not in str(caught.value)
 
 
