@@ -163,7 +163,7 @@ def test_help_shows_usage_every_value_and_options_that_compose(name, capsys, mon
         assert max(len(line) for line in page.splitlines()) <= 122
     assert len(pages["--help"].splitlines()) <= 100
     whole = set(pages["--help=all"].splitlines())
-    words = pages["--help"].partition("the same of one: ")[2].replace("\n", " ")
+    words = pages["--help"].partition("the same for one of ")[2].replace("\n", " ")
     for word in words.split(", ") if words else ():
         monkeypatch.setattr(sys, "argv", [name, f"--help={word.strip()}"])
         command()
@@ -230,7 +230,7 @@ LAUGHS = "a0: &a0 [x]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] 
         ("mu: [", "not YAML"),
         ("mu: !!python/name:os.system\n", "not YAML"),
         ("mu: " + 5000 * "9", "not YAML|Exceeds the limit"),
-        ("- 1", "holds no key: value pairs"),
+        ("- 1", "the file has no key: value pairs"),
     ],
 )
 def test_a_model_file_that_would_take_for_ever_is_refused_in_one_line(content, why, tmp_path):
@@ -285,10 +285,10 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
         ("train", "+experiment=paper", ["experiment=paper: a recipe of benchmark"]),
         ("benchmark", "experiment=smoke", ["experiment=smoke: a recipe of train"]),
         ("deploy", "+experiment=smoke", ["experiment=smoke: a recipe of train"]),
-        ("train", "plant=bench", ["plant=bench: train takes env, agent, experiment,", "plant= is for deploy"]),
-        ("benchmark", "plant=bench", ["plant=bench: benchmark takes env, experiment; plant= is for deploy"]),
-        ("report", "agent=tuned", ["agent=tuned: report takes no group; agent= is for train"]),
-        ("mark", "+safety=default", ["safety=default: mark takes no group; safety= is for deploy"]),
+        ("train", "plant=bench", ["plant=bench: train accepts env, agent, experiment,", "plant= is for deploy"]),
+        ("benchmark", "plant=bench", ["plant=bench: benchmark accepts env, experiment; plant= is for deploy"]),
+        ("report", "agent=tuned", ["agent=tuned: report accepts no group; agent= is for train"]),
+        ("mark", "+safety=default", ["safety=default: mark accepts no group; safety= is for deploy"]),
     ],
 )
 def test_a_wrong_word_is_one_line_with_key_value_and_what_is_allowed(name, override, parts):
@@ -336,7 +336,7 @@ def test_an_address_that_cannot_be_one_is_refused_with_the_config(backend, key, 
     [
         ("train", "agent=tuned,papr,paper", "agent=papr: no such option; allowed: "),
         ("deploy", "controller=pi,mpc,pid", "controller=pid: no such option; allowed: "),
-        ("train", "+experiment=smoke,paper", "experiment=paper: a recipe of benchmark; python -m"),
+        ("train", "+experiment=smoke,paper", "experiment=paper: a recipe of benchmark; use python -m"),
     ],
 )
 def test_each_preset_that_a_sweep_goes_over_is_judged_before_a_job_begins(name, override, line):
@@ -375,7 +375,7 @@ def test_a_value_beside_resume_is_refused_wherever_it_is_typed(where, tmp_path, 
     given = [f"resume={tmp_path}", "hydra.verbose=true"]
     main._answer(given)
     assert goes_on == ["train"]
-    line = f"seed=7: a resumed run takes every value from {tmp_path}/config.yaml; drop it"
+    line = f"seed=7: a resumed run has all values in {tmp_path}/config.yaml; drop this one"
     with pytest.raises(frame.UserError, match=f"^{re.escape(line)}$"):
         main._answer([*given[:where], "seed=7", *given[where:]])
     assert goes_on == ["train"]
@@ -443,7 +443,7 @@ def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
         (tmp_path / name / "config.yaml").touch()
     words = frame.normalise([f"resume={tmp_path}/a", f"resume={tmp_path}/b"], "train")
     assert words[-2:] == [f"hydra.run.dir={tmp_path}/b", "hydra.output_subdir=null"]
-    with pytest.raises(frame.UserError, match=rf"^resume={tmp_path}/c: no run folder \(it holds no config\.yaml\)"):
+    with pytest.raises(frame.UserError, match=rf"^resume={tmp_path}/c: not a run folder \(no config\.yaml\)"):
         frame.normalise([f"resume={tmp_path}/c"], "train")
 
 

@@ -1,3 +1,3 @@
-"""From a command line to a checked config and a run folder; how a command ends.
+"""Frame of every command: command line, checked config, run folder, signals, exit status.
 
-Commands import this room first; other rooms import `UserError`. It imports conf, the atomic writer and tables."""
+Every command imports this package first. Other packages import files and errors from it."""

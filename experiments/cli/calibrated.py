@@ -1,4 +1,4 @@
-"""What a calibration leaves for other commands, from its files: growth model, and plant behind a recording."""
+"""Readers of two output files of `calibrate`: the growth model, and the plant that resembles a recording."""
 
 from typing import TypeVar
 
@@ -22,14 +22,14 @@ def read_plant_file(path: str) -> PlantConfig:
 
 
 def _read(key: str, path: str, usual: str, default: T, prefix: str) -> T:
-    """Return `default` with the values of the file. Raises: UserError."""
+    """Return `default` with its values replaced by those of the file. Raises: UserError."""
     remedy = f"give the {usual} of a calibration run"
     try:
         content = files.load_yaml(path)
     except (OSError, ValueError) as error:
         raise frame.UserError(f"{key}={path}: {getattr(error, 'strerror', error)}; {remedy}") from None
     if not isinstance(content, DictConfig) or not content:
-        raise frame.UserError(f"{key}={path}: holds no key: value pairs; {remedy}")
+        raise frame.UserError(f"{key}={path}: the file has no key: value pairs; {remedy}")
     try:
         return frame.load(content, default, prefix)
     except frame.UserError as error:

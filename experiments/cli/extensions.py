@@ -1,7 +1,7 @@
 """Extensions by a user: Python files by `extend=FILE.py`, presets by `group=FILE.yaml`.
 
-A Python file registers its extensions (docs/extending.md) when it is loaded. The variable `TURBIDOSTAT_EXTEND` lists
-the files for all processes and cluster jobs of a command. The run folder keeps a copy, which `resume=RUN` loads.
+A Python file registers its extensions (docs/extending.md) when it is loaded. The environment variable
+`TURBIDOSTAT_EXTEND` lists the files for every process and cluster job. `resume=RUN` loads the run folder's copy.
 """
 
 import importlib.util
@@ -25,9 +25,9 @@ _loaded: dict[Path, str] = {}  # file -> name of its module
 
 
 def taken(argv: Sequence[str]) -> list[str]:
-    """Load the files of `extend=FILE.py[,FILE.py]`, here and in processes started later; return the other arguments.
+    """Load the files of `extend=FILE.py[,FILE.py]`, also in later processes; return the other arguments.
 
-    Raises: ValueError naming a file and what is wrong with it.
+    Raises: ValueError with the file and its error.
     """
     given = [arg.removeprefix("extend=").split(",") for arg in argv if arg.startswith("extend=")]
     paths = [str(Path(name).expanduser().resolve()) for names in given for name in names if name]
@@ -42,9 +42,9 @@ def _remember(paths: Sequence[str]) -> None:
 
 
 def load_all() -> None:
-    """Load the guests, and every file that `TURBIDOSTAT_EXTEND` names and that is not loaded yet.
+    """Load the guest packages, and the files in `TURBIDOSTAT_EXTEND` that are not loaded yet.
 
-    Raises: ValueError as `taken`.
+    Raises: ValueError with the file and its error.
     """
     guests.load("experiments")
     for name in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
@@ -56,24 +56,24 @@ def _load(path: Path) -> None:
         return
     module = path.stem
     if path.suffix != ".py" or not path.is_file():
-        raise ValueError(f"extend={path}: no such Python file; give the file that registers what you add")
+        raise ValueError(f"extend={path}: no such Python file; give the file that registers your extension")
     if not module.isidentifier() or module in sys.modules:
-        raise ValueError(f"extend={path}: a module {module} is there already; give the file another name")
+        raise ValueError(f"extend={path}: {module} is no name for a new module, or in use; rename the file")
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
-        raise ValueError(f"extend={path}: no Python file")
-    sys.modules[module] = importlib.util.module_from_spec(spec)  # so that its definitions can be sent to a worker
+        raise ValueError(f"extend={path}: not a Python file")
+    sys.modules[module] = importlib.util.module_from_spec(spec)  # so that worker processes can unpickle its classes
     try:
         spec.loader.exec_module(sys.modules[module])
     except Exception as error:
         del sys.modules[module]
         line = _line_in(path, error)
-        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; correct that file") from None
+        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; correct this file") from None
     _loaded[path] = module
 
 
 def _line_in(path: Path, error: Exception) -> str:
-    """Return the line of the error in the file, ":12"."""
+    """Return the line number of an error in the file with a colon, ":12"; "" if unknown."""
     numbers = [error.lineno or 0] if isinstance(error, SyntaxError) else []
     numbers += [line for stack, line in walk_tb(error.__traceback__) if stack.f_code.co_filename == str(path)]
     return f":{numbers[-1]}" if numbers else ""
@@ -82,7 +82,7 @@ def _line_in(path: Path, error: Exception) -> str:
 def preset_file(group: str, option: str) -> str:
     """Register `group=FILE.yaml` as a preset and return its name; return any other option as it is.
 
-    Raises: ValueError naming the file and what is wrong with it.
+    Raises: ValueError with the file and its error.
     """
     if not option.endswith(".yaml"):
         return option
@@ -90,12 +90,12 @@ def preset_file(group: str, option: str) -> str:
     try:
         content = files.load_yaml(path)
         if not isinstance(content, DictConfig):
-            raise ValueError("it holds no keys and values")
+            raise ValueError("the file has no keys and values")
         values = OmegaConf.to_container(content)
         assert isinstance(values, dict)
         known, what = presets.added().get(f"{group}/{name}"), f"The file {path.resolve()}."
         if known is not None and known.what != what:
-            raise ValueError("another file of this name is given; rename one")
+            raise ValueError("two files have this name; rename one")
         presets.add(f"{group}/{name}", {str(k): v for k, v in values.items()}, what)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
@@ -104,7 +104,7 @@ def preset_file(group: str, option: str) -> str:
 
 
 def offer() -> None:
-    """Offer the added presets to Hydra."""
+    """Register the added presets with Hydra."""
     for name, preset in presets.added().items():
         group, _, option = name.rpartition("/")
         package = "_global_" if group in RECIPES else None
@@ -121,7 +121,7 @@ def keep(folder: Path) -> None:
 
 
 def kept(folder: Path) -> None:
-    """Load the extension files in a run folder, if any. Raises: ValueError as `taken`."""
+    """Load the extension files of a run folder, if any. Raises: ValueError with the file and its error."""
     names = set(_loaded.values())
     _remember([str(path.resolve()) for path in sorted((folder / FOLDER).glob("*.py")) if path.stem not in names])
     load_all()

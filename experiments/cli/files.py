@@ -1,4 +1,4 @@
-"""JSON files of all commands, written atomically; YAML files as all commands read them; command line of a run."""
+"""Atomic writer of JSON files, safe reader of YAML files, and reader of a run's command line."""
 
 import io
 import json
@@ -17,9 +17,9 @@ from hardware.storage.yaml_text import problem, read_text
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:
-    """Load a YAML file without aliases and interpolations, because a few lines of those can expand to gigabytes.
+    """Load a YAML file; refuse aliases and interpolations, because a few lines of them can expand to gigabytes.
 
-    Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
+    Raises: OSError; ValueError with a message of one line, also for a file that is too large or nested too deeply.
     """
     text = read_text(path)
     try:
@@ -39,7 +39,7 @@ BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
 
 
 def given(folder: Path) -> list[str]:
-    """List the arguments of a run folder's command line, `key=value` each; [] if unknown."""
+    """List the `key=value` arguments of the command line that made a run folder; [] if unknown."""
     with suppress(OSError, ValueError, yaml.YAMLError):
         words = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
         return [str(word).lstrip("+") for word in words] if isinstance(words, list) else []
@@ -47,7 +47,7 @@ def given(folder: Path) -> list[str]:
 
 
 def choices(folder: Path) -> dict[str, str]:
-    """Map group to preset of a run folder, without groups that have no preset; {} if unknown."""
+    """Map each group to its preset for a run folder; omit groups without a preset; {} if unknown."""
     path = folder / ".hydra" / "hydra.yaml"
     block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
     pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))

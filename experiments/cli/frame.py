@@ -1,7 +1,7 @@
-"""The frame of every entry point: command line -> Hydra -> checked dataclass -> run folder.
+"""Frame of every command: command line -> Hydra -> checked dataclass -> run folder.
 
-Hydra composes plain YAML; the dataclass of the entry point is the schema. An argument that does not fit (unknown key,
-wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
+Hydra composes plain YAML; the command's dataclass is the schema. An invalid argument (unknown key, wrong type, value
+out of range, misspelt option) gives one line on standard error, before a run folder exists.
 """
 
 import errno
@@ -36,12 +36,12 @@ from experiments.cli.words import refusing as refusing
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-for talker in ("httpx", "torch"):  # of every request, as journal and summary do; of its caches at the end
+for talker in ("httpx", "torch"):  # httpx logs every request, as the journal does; torch logs its caches at exit
     logging.getLogger(talker).setLevel(logging.WARNING)
 
 
 class _Once(logging.Filter):
-    """Filter that passes a repeated warning of another library once, only to the log."""
+    """Filter that logs a repeated warning of another library only once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class _Once(logging.Filter):
         kind = re.sub(r"\d+", "", record.getMessage())
         if kind not in self._said:
             self._said.add(kind)
-            log.warning("%s: %s (said once)", record.name, record.getMessage())
+            log.warning("%s: %s (shown once)", record.name, record.getMessage())
         return False
 
 
@@ -66,7 +66,7 @@ REFUSALS = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), SPACE),
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG), PLACE),
 }
-"""Errors of a disk that refuses a file, and the remedies."""
+"""Error numbers of a disk that refuses a file -> remedies."""
 
 
 OPTIONS = frozenset((
@@ -82,7 +82,7 @@ def _one_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines()]
     if several := SEVERAL.match(lines[0] if lines else ""):
         word = several[1]
-        return f"{word}: several values are a sweep, which begins with -m (-m '{word}'); a list is written [1,2]"
+        return f"{word}: several values need a sweep; start it with -m (-m '{word}'), or write a list as [1,2]"
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
 
@@ -90,7 +90,7 @@ def _one_line(error: Exception) -> str:
 def _refusal(error: BaseException | None) -> str | None:
     """Return the message for a disk error, None for any other error.
 
-    The writer may have wrapped the system's error in its own, as torch and logging do.
+    The disk error may be the cause of another error, e.g. of torch or logging.
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno in REFUSALS:
@@ -100,13 +100,13 @@ def _refusal(error: BaseException | None) -> str | None:
 
 
 def _in_thread(failed: threading.ExceptHookArgs) -> None:
-    """Pass a disk error in an event writer's thread to the run, which reports it; show other errors."""
+    """Show an error of a thread, except a disk error in an event writer's thread, which the run itself reports."""
     if _refusal(failed.exc_value) is None:
         threading.__excepthook__(failed)
 
 
 def _silence(stream: TextIO) -> None:
-    """Close a stream for good, so that the interpreter's end writes nothing either."""
+    """Send all further output of a stream to /dev/null, also that at the interpreter's exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -114,8 +114,8 @@ def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
     """Convert a composed config to the checked dataclass.
 
     Args:
-      schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
-      prefix: key of the config, for messages.
+      schema: an instance with the defaults; each nested dataclass checks its ranges in `__post_init__`.
+      prefix: key of the config, shown in messages.
     Raises: UserError with key, value and allowed values.
     """
     try:
@@ -155,28 +155,28 @@ def _stored(path: Path, resume: str, schema: T) -> T:
     try:
         stored = files.load_yaml(path)
         if not isinstance(stored, DictConfig):
-            raise UserError("it holds no keys and values")
+            raise UserError("the file has no keys and values")
         stored.resume = resume
         config = load(stored, schema)
         if missing := [f.name for f in fields(cast(Any, schema)) if f.name not in stored]:
-            raise UserError(f"it has no {missing[0]}")
+            raise UserError(f"key {missing[0]} is missing")
         return config
     except (UserError, OSError, ValueError, AttributeError, OmegaConfBaseException) as error:
         why = _one_line(error) or type(error).__name__
-        older = "a run of an earlier version goes on with that version only"
-        remedy = f"{older}; put it back as the run wrote it, or start a new run"
+        older = "only the version that started a run can continue it"
+        remedy = f"{older}; restore the file as the run wrote it, or start a new run"
         raise UserError(f"{path}: not the config of this run ({why}); {remedy}") from None
 
 
 @dataclass(frozen=True)
 class EntryPoint(Generic[T]):
-    """An entry point; a call runs it. `config.yaml` of the run folder has its config before `body` starts.
+    """Entry point of a command; call it to run the command. It writes config.yaml before `body` starts.
 
-    name: of `conf/<name>.yaml` and of the job.
-    schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
-    body: called with the checked config and the run folder; may return the sweep's objective.
+    name: name of the command, of `conf/<name>.yaml` and of the Hydra job.
+    schema: default instance of the command's config dataclass; a field `resume` makes the command resumable.
+    body: function of the checked config and the run folder; may return the sweep's objective.
     resumes: file of a run folder that `resume=` needs, "" for a command without `resume=`.
-    goes_on: a stopped job of a sweep continues from that file, to the same result; otherwise it starts again.
+    goes_on: whether a stopped job of a sweep continues from that file, to the same result; if not, it starts again.
     """
 
     name: str
@@ -223,7 +223,7 @@ class EntryPoint(Generic[T]):
         flags = {a for a in given if a.startswith("-")}
         if unknown := sorted(flag for flag in flags if flag.partition("=")[0] not in OPTIONS):
             key, _, value = unknown[0].lstrip("-").partition("=")
-            raise UserError(f"{unknown[0]}: no such option; values are given as {key}={value or 'VALUE'}; see --help")
+            raise UserError(f"{unknown[0]}: no such option; give values as {key}={value or 'VALUE'}; see --help")
         about = next((a.removeprefix("--help=") for a in flags if a.startswith("--help=")), "")
         plain = [a for a in given if not a.startswith("-")]
         if about or flags & {"--help", "-h"}:
@@ -247,10 +247,10 @@ class EntryPoint(Generic[T]):
             resumed = words.resumed(given)
             others = [a for a in given if not a.startswith(("resume=", "hydra."))]
             if resumed and others:
-                raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
+                raise UserError(f"{others[0]}: a resumed run has all values in {resumed}/config.yaml; drop this one")
             for taken in [a.removeprefix(words.RUN) for a in given if a.startswith(words.RUN)]:
                 if self.resumes and not resumed and (Path(taken) / self.resumes).is_file():
-                    raise UserError(f"{words.RUN}{taken}: holds a run; continue it by resume={taken}, or name another")
+                    raise UserError(f"{words.RUN}{taken}: holds a run; give resume={taken}, or a new folder")
         self._hydra()
 
     def _hydra(self) -> None:
@@ -258,11 +258,11 @@ class EntryPoint(Generic[T]):
         if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
             sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
         GlobalHydra.instance().clear()
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its error; the message is decided above
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its error, and `__call__` shows the message
         hydra.main(config_path="pkg://conf", config_name=self.name, **BASE)(self._job)()
 
     def _sweep(self, swept: sweep.Sweep) -> None:
-        """Run every job of a sweep, and log how many finished. Exits: 1 if one failed."""
+        """Run every job of a sweep and print how many finished. Exits: 1 if a job failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
         self._refuse([swept.arguments] if expected is None else expected)
@@ -274,7 +274,7 @@ class EntryPoint(Generic[T]):
         except (KeyboardInterrupt, SystemExit):
             print(f"stopped; {sweep.progress(swept, expected)}", file=sys.stderr)
             sys.exit(stop.STATUS)
-        except Exception:  # a bug in a job, which Hydra raises again after all jobs; or in a launcher
+        except Exception:  # a bug in a launcher, or in a job: Hydra raises the job's error again after all jobs
             print(sweep.progress(swept, expected), file=sys.stderr)
             raise
         errors = sweep.errors(swept.folder, expected)
@@ -295,7 +295,7 @@ class EntryPoint(Generic[T]):
 
     def _job(self, cfg: DictConfig) -> float | None:
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
-        extensions.load_all()  # not loaded yet in a worker of a sweep
+        extensions.load_all()  # the worker process of a sweep has not loaded them yet
         if swept():
             return self._swept_job(cfg, folder)
         try:
@@ -321,13 +321,13 @@ class EntryPoint(Generic[T]):
             sys.exit(1)
 
     def _swept_job(self, cfg: DictConfig, folder: Path) -> float | None:
-        """Run one job of a sweep; earlier results remain, also those of a killed process.
+        """Run one job of a sweep and keep the results of earlier processes, even of a killed one.
 
-        A failed job is recorded; the launcher continues with the others.
+        A failed job is recorded, and the launcher continues with the other jobs.
         """
         try:
             searched = HydraConfig.get().runtime.choices.get("hparams_search") not in (None, "null")
-            with sweep.working(folder, wait=searched):  # a search needs the result of any process
+            with sweep.working(folder, wait=searched):  # a search needs the result, whichever process computes it
                 return self._once(cfg, folder, sweep.Job.at(folder))
         except KeyboardInterrupt:
             sys.exit(stop.STATUS)
@@ -356,7 +356,7 @@ class EntryPoint(Generic[T]):
             return None
         except Exception as error:
             line = _refusal(error) or _one_line(error) or type(error).__name__
-            if job.state != "finished":  # its result remains for any new arguments
+            if job.state != "finished":  # a finished job keeps its result, also after invalid new arguments
                 with suppress(OSError):  # a full disk
                     job.save("failed", error=line)
             if not isinstance(error, UserError) and _refusal(error) is None:
@@ -365,10 +365,10 @@ class EntryPoint(Generic[T]):
             return None
 
     def _left(self, folder: Path) -> str:
-        """Describe the state of an unfinished run and how to continue it."""
+        """Describe the files of an unfinished run and how to continue the run."""
         own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$|reactors$|agents$")
         names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
         if self.resumes and (folder / self.resumes).is_file():
-            return f"{kept}; go on with: python -m {program(self.name)} resume={shlex.quote(str(folder))}"
-        return f"{kept}; to try again, start anew"
+            return f"{kept}; continue with: python -m {program(self.name)} resume={shlex.quote(str(folder))}"
+        return f"{kept}; to try again, start a new run"

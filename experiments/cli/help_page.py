@@ -1,6 +1,6 @@
 """Text of `--help`: usage, presets, and values with meaning and range.
 
-Usage is the opening comment of conf/NAME.yaml; the rest comes from the fields of the command's config.
+The usage is the opening comment of conf/NAME.yaml. The values come from the fields of the command's config.
 """
 
 import textwrap
@@ -17,7 +17,7 @@ LEFT = 44  # columns of `key = value`
 
 
 def shown(value: Any) -> str:
-    """Write a value as on a command line."""
+    """Return a value as typed on a command line."""
     if isinstance(value, list | tuple):
         return "[" + ",".join(shown(v) for v in value) + "]"
     if isinstance(value, dict):
@@ -37,7 +37,7 @@ def _line(left: str, right: str, at: int) -> list[str]:
 
 
 def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
-    """List the plain values of a config, then its parts with their values; without `deep` one line per part."""
+    """Yield lines for the plain values of a config, then for the values of its parts; not `deep`: one line per part."""
     parts: list[tuple[str, str, Any]] = []
     default = type(config)()
     for entry in entries(config):
@@ -48,7 +48,7 @@ def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
             yield from _line(f"  {key}.NAME", f"{entry.said.what}: {', '.join(entry.value)}", LEFT)
             name, first = next(iter(entry.value.items()))
             if is_dataclass(first):
-                parts.append((f"{key}.NAME", f"here the values of {name}", first))
+                parts.append((f"{key}.NAME", f"the values of {name}, as an example", first))
         else:
             usual = getattr(default, entry.name)
             notes = [f"allowed: {entry.allowed}"] if entry.allowed else []
@@ -69,7 +69,7 @@ def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
 
 
 def _group(name: str, group: str, start: str | None) -> list[str]:
-    lines = [f"  {group}=" + (f"    (by itself {start})" if start else "")]
+    lines = [f"  {group}=" + (f"    (default {start})" if start else "")]
     return lines + [
         x for option in options(name, group) for x in _line(f"    {option}", sentence(f"{group}/{option}"), 26)
     ]
@@ -81,7 +81,7 @@ def _short(name: str, config: Any) -> list[str]:
         for group, start in chosen(name).items()
         for line in _line(
             f"  {group}=",
-            " | ".join(options(name, group)) + (f"    (by itself {start})" if start else ""),
+            " | ".join(options(name, group)) + (f"    (default {start})" if start else ""),
             26,
         )
     ]
@@ -89,7 +89,7 @@ def _short(name: str, config: Any) -> list[str]:
     words = _parts(name, config)
     number = sum(1 for _ in _leaves(config))
     more = ["", f"--help=all    every choice and every value, with unit, range and default ({number})"]
-    more += textwrap.wrap(f"--help=NAME   the same of one: {', '.join(words)}", WIDTH, subsequent_indent=" " * 14)
+    more += textwrap.wrap(f"--help=NAME   the same for one of {', '.join(words)}", WIDTH, subsequent_indent=" " * 14)
     own = ["Values (key=value)", "", *_values(config, "", deep=False)]
     return [*opening(name), "", *head, *own, *(more if words else ())]
 
@@ -103,15 +103,15 @@ def _leaves(config: Any) -> Iterator[str]:
 
 
 def _parts(name: str, config: Any) -> dict[str, Any]:
-    """Map the groups of a command to parts of its config; None where a group has no part of its name."""
+    """Map the groups and parts of a command by name to parts of its config; None for a group that is no part."""
     return dict.fromkeys(chosen(name)) | {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
 
 
 def text(name: str, config: Any, about: str = "") -> str:
-    """Write the text of `--help`, with the values that the rest of the command line gives.
+    """Return the text of `--help`, with the values that the rest of the command line gives.
 
-    Args: name: of the command; config: what it would run with; about: "all", a group or a part of the config with its
-      own values; "": what one looks for first.
+    Args: name: name of the command. config: its config. about: "all", or one group or part of the config; "" for the
+      short page.
     Raises: ValueError for an unknown `about`.
     """
     if not about:

@@ -1,4 +1,4 @@
-"""`latest`: the newest output of a command below runs/, as a value without a folder's name."""
+"""Value `latest` of an argument: the newest output of a command below runs/."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,20 +10,20 @@ WRITTEN = {
     "runs": (("*/*/sweep.json",), "train -m 'seed=range(0,4)'"),
     "run": (("deploy/*/recordings", "demo/*/4_deploy/recordings"), "deploy"),
 }
-"""Key -> where its files are below runs/, and the command that writes them."""
-FOLDERS = ("resume", "runs", "run")  # keys that get the folder of the found file
+"""Key of an argument -> patterns of its files below runs/, and the command that writes them."""
+FOLDERS = ("resume", "runs", "run")  # keys whose value is the folder of the file found
 
 
 def newest(patterns: Sequence[str]) -> Path | None:
-    """Find the newest file that matches below `ROOT`, None if there is none."""
+    """Return the newest file below `ROOT` that matches a pattern, None without one."""
     found = [path for pattern in patterns for path in ROOT.glob(pattern)]
     return max(found, key=lambda path: path.stat().st_mtime, default=None)
 
 
 def resolved(arg: str, command: str) -> str:
-    """Replace `latest` of these keys and of `resume` by the path; return other arguments unchanged.
+    """Replace the value `latest` of `resume` and of the keys in `WRITTEN` by a path; return other arguments unchanged.
 
-    Args: command: of the resumed run. Raises: ValueError without a file, with the command that writes it.
+    Args: command: name of the command. Raises: ValueError if there is no such file, with the command that writes it.
     """
     key, _, value = arg.partition("=")
     name = key.lstrip("+")
@@ -33,6 +33,6 @@ def resolved(arg: str, command: str) -> str:
     patterns, writer = WRITTEN.get(name, (runs, command))
     path = newest(patterns)
     if path is None:
-        what = "no sweep" if name == "runs" else "nothing of the kind"
+        what = "no sweep" if name == "runs" else "no such output"
         raise ValueError(f"{arg}: {what} under {ROOT}/; run python -m experiments.{writer} first, or give a path")
     return f"{key}={path.parent if name in FOLDERS else path}"

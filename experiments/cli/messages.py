@@ -1,4 +1,4 @@
-"""Messages of a command while a reactor runs."""
+"""Message of a command while it stops its reactors."""
 
 from conf.messages import Message
 
@@ -6,4 +6,4 @@ from conf.messages import Message
 
 class PumpsBeingEnded(Message, says="the pumps are being switched off and verified; this takes up to a minute",
     remedy="wait"):
-    """A second Ctrl-C."""
+    """Reply to a second Ctrl-C."""

@@ -12,13 +12,13 @@ from contextlib import suppress
 from typing import Any, Generic, TextIO, TypeVar
 
 T = TypeVar("T")
-LAST_S, WAITING = 2.0, 2000  # for remaining output at the end of a program; largest number of waiting pieces
+LAST_S, WAITING = 2.0, 2000  # longest wait for output at the program's end, s; largest number of queued pieces
 
 
 class Outlet(Generic[T]):
     """A queue of at most `size` items, and a thread that sends them in order. `put` neither waits nor raises.
 
-    Attributes: dropped: number of items that found no room.
+    Attributes: dropped: number of items dropped because the queue was full.
     """
 
     def __init__(self, send: Callable[[T], None], size: int) -> None:
@@ -48,7 +48,7 @@ class Outlet(Generic[T]):
 
 
 class Screen:
-    """A standard stream that never makes its writer wait; dropped lines are counted and reported later."""
+    """A standard stream that never makes its writer wait. It counts dropped lines and reports their number later."""
 
     def __init__(self, stream: TextIO, size: int = WAITING) -> None:
         self._stream, self._number, self._lines = stream, stream.fileno(), 0
@@ -56,8 +56,8 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Queue the text; return its length."""
-        told = f"... {self._lines} lines are missing here, because the screen was blocked; the log file has all\n"
-        room = self.outlet.put((told * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
+        lost = f"... {self._lines} lines are missing here, because the screen was blocked; the log file has all lines\n"
+        room = self.outlet.put((lost * bool(self._lines) + text).encode(self._stream.encoding, "replace"))
         self._lines = 0 if room else self._lines + text.count("\n")
         return len(text)
 
@@ -66,7 +66,7 @@ class Screen:
             left = left[os.write(self._number, left) :]
 
     def close(self) -> None:
-        """Report dropped lines, and wait at most `LAST_S` for queued output."""
+        """Report the number of dropped lines, and wait at most `LAST_S` for queued output."""
         self.write("")
         self.outlet.close(LAST_S)
 
@@ -78,7 +78,7 @@ class Screen:
 
 
 def _may_wait(stream: TextIO) -> bool:
-    """Tell whether a reader can make the writer wait: a terminal (Ctrl-S), a pipe or a socket."""
+    """Return whether the stream's reader can block a writer, as a terminal (Ctrl-S), a pipe or a socket can."""
     try:
         mode = os.fstat(stream.fileno()).st_mode
     except (AttributeError, OSError, ValueError):
@@ -87,7 +87,7 @@ def _may_wait(stream: TextIO) -> bool:
 
 
 def detach() -> None:
-    """Write standard output and error through threads from now on, so that no caller waits for a reader. Idempotent."""
+    """Write standard output and standard error through threads, so that no caller waits for a reader. Idempotent."""
     for name in ("stdout", "stderr"):
         before = getattr(sys, name)
         if not _may_wait(before):

@@ -1,4 +1,4 @@
-"""The reference of the configuration, docs/configuration.md, from the fields of every config and the presets of conf/.
+"""Generator of docs/configuration.md from the fields of every config and the presets of conf/.
 
 python -m experiments.cli.reference > docs/configuration.md
 """
@@ -19,7 +19,7 @@ from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 
 ELSEWHERE = ("env", "agent")  # kinds that docs/extending.md describes
-SHORT = 3  # values of a preset; longer ones stand in its file
+SHORT = 3  # most values of a preset on the page; for a longer preset the page names the file
 SINGULAR = {"studies": "study"}  # for other names remove the s
 HEAD = """# Configuration
 
@@ -29,15 +29,15 @@ them. After a change:
     python -m experiments.cli.reference > docs/configuration.md
 
 A value is set by `key=value` and a preset is chosen by `group=preset`, in any order, after
-`python -m experiments.NAME`. `--help` prints a command's keys with the values that the rest of its line gives.
-`--cfg job` prints the resolved config, which every run keeps as `config.yaml` in its folder. A key that belongs to a
-part is written with the part's name before it: `bench.max_rate=0.01`. Each line below has a key with its default, the
-unit, the allowed values in brackets, and the meaning.
+`python -m experiments.NAME`. `--help` prints a command's keys with the values that the other arguments set.
+`--cfg job` prints the resolved config, which every run keeps as `config.yaml` in its folder. Write a key of a part with
+the part's name in front: `bench.max_rate=0.01`. Each line below has a key with its default, the unit, the allowed
+values in brackets, and the meaning.
 """
 
 
 def page() -> str:
-    """Write the whole page."""
+    """Return the text of the whole page."""
     extensions.load_all()
     known: dict[str, EntryPoint[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
     parts: dict[type[Any], str] = {}
@@ -59,7 +59,7 @@ def page() -> str:
     lines += [
         "## Presets",
         "",
-        "Each with what differs from the defaults or from the preset in brackets, or with the file that has it.",
+        "Each line has the values that differ from the defaults (or from the preset in brackets), or their file.",
         "",
     ]
     for group, options in groups().items():
@@ -72,7 +72,7 @@ def _anchor(heading: str) -> str:
 
 
 def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
-    """Yield the command's config with every kind of part that it may hold."""
+    """Yield the command's config, once for every kind of part that the config may have."""
     yield command.config()
     several = [entry.name for entry in entries(command.schema) if entry.said.kinds and entry.name not in ELSEWHERE]
     for group in (name for name in several if name in chosen(command.name)):
@@ -81,7 +81,7 @@ def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
 
 
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
-    """Collect every part below a config with its first name."""
+    """Collect the class of every part below a config, with the name under which it comes first."""
     for entry in entries(config):
         values, name = [entry.value], entry.name
         if isinstance(entry.value, dict):
@@ -94,7 +94,7 @@ def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
 
 
 def _part(config: Any, entry: Entry) -> type[Any] | None:
-    """Return the class of a field's part, or of its parts by name."""
+    """Return the dataclass of a field's part, or of the parts in a field's dict; None for a plain value."""
     of: Any = type(entry.value)
     if of is dict:
         of = get_args(get_type_hints(type(config))[entry.name])[1]
@@ -102,7 +102,7 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
 
 
 def _settings(config: Any, parts: dict[type[Any], str]) -> list[str]:
-    """Write a line per field; a part has a section of its own."""
+    """Return a line for each field; a part is a link to its own section."""
     lines = []
     for entry in entries(config):
         of = _part(config, entry)
@@ -113,7 +113,7 @@ def _settings(config: Any, parts: dict[type[Any], str]) -> list[str]:
 
 
 def _preset(group: str, option: str) -> str:
-    """Write what a preset is, the preset it starts from, and the values of its own file."""
+    """Return the line of a preset: name, preset that it starts from, meaning, and the values of its own file."""
     own = yaml.safe_load((ROOT / f"{group}/{option}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
     values = [f"{key}={shown(value)}" for key, value in flat(own) if (key, value) != ("kind", option)]

@@ -1,8 +1,8 @@
-"""Consecutive Hydra jobs at values that Optuna chooses from the results of earlier jobs.
+"""Hydra sweeper in which Optuna chooses the values of each job from the results of earlier jobs.
 
-All processes with the same `hydra.sweep.dir` share one search. Another process continues an unfinished trial in the
-same folder. hydra-optuna-sweeper 1.3.0 does neither: it needs Optuna 2, whose shared storage needs SQLAlchemy 1,
-numbers the folders of each process from 0, and leaves a killed trial running without limit.
+All processes with the same `hydra.sweep.dir` share one search. If a process ends, another one continues its trial in
+the same folder. hydra-optuna-sweeper 1.3.0 does neither: it needs Optuna 2, whose shared storage needs SQLAlchemy 1,
+numbers the folders of each process from 0, and leaves a killed trial in the state running without limit.
 """
 
 import fcntl
@@ -56,8 +56,8 @@ class Search(Sweeper):
     """Minimiser of the objective over a space of values, shared through one file in the sweep's folder.
 
     Args:
-      trials: of the whole search, over all processes and restarts, including failed ones.
-      at_once: jobs per launch. space: dotted key -> allowed values.
+      trials: number of trials of the search, over all processes and restarts, including failed ones.
+      at_once: number of jobs in a launch. space: dotted key -> allowed values.
     """
 
     def __init__(self, trials: int, at_once: int, space: DictConfig) -> None:
@@ -66,7 +66,7 @@ class Search(Sweeper):
         self._held: dict[int, IO[str]] = {}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Set up as Hydra requires, before `sweep`."""
+        """Store Hydra's context and make the launcher; Hydra calls this before `sweep`."""
         self.hydra_context, self.config = hydra_context, config
         self.folder = Path(str(config.hydra.sweep.dir))
         self.launcher: Launcher = Plugins.instance().instantiate_launcher(
@@ -84,7 +84,7 @@ class Search(Sweeper):
             return optuna.create_study(storage=storage, sampler=sampler, study_name="search", load_if_exists=True)
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run trials until their number is reached. Args: arguments: overrides of every trial."""
+        """Run trials until there are `trials` of them. Args: arguments: overrides of every trial."""
         study = self._open()
         while batch := self._take(study):
             overrides = [[*arguments, *self._values(t), f"hydra.sweep.subdir={t.number}"] for t in batch]
@@ -97,7 +97,7 @@ class Search(Sweeper):
         return [f"++{name}={value}" for name, value in trial.params.items()]
 
     def _take(self, study: Any) -> list[Any]:
-        """Return trials for the next launch: first those whose process has ended, then new ones."""
+        """Return trials for the next launch: first unfinished ones whose process has ended, then new ones."""
         taken: list[Any] = []
         with self._alone():
             for trial in study.get_trials(deepcopy=False):
@@ -111,7 +111,7 @@ class Search(Sweeper):
         return taken
 
     def _hold(self, number: int) -> bool:
-        """Reserve a trial for this process until its result or the process's end; False if another has it."""
+        """Reserve a trial until it has a result or this process ends; return False if another process has the trial."""
         if number in self._held:
             return False
         file = open(self.folder / ".trials" / str(number), "w")  # noqa: SIM115  (open as long as it is held)

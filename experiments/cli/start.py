@@ -1,4 +1,4 @@
-"""Checks before a command imports anything: origin of the packages, and Ctrl-C during the start."""
+"""First steps of a command, before its imports: check the origin of the packages, and handle Ctrl-C."""
 
 import re
 import sys
@@ -13,9 +13,9 @@ WINDOWS = "this program needs Linux or macOS; on Windows run it inside WSL (wsl 
 
 
 def begin() -> None:
-    """Refuse packages of other projects. Raises: SystemExit with one line for a command, ImportError for a library."""
+    """Refuse Windows, and packages of other projects. Raises: SystemExit in a command, ImportError in a library."""
     first = Path(sys.argv[0] if sys.argv else "").name
-    command = first in ("-m", "turbidostat")  # the interpreter still searches the command, or the script imports it
+    command = first in ("-m", "turbidostat")  # "-m" while the interpreter is still looking for the command
     if line := WINDOWS if sys.platform == "win32" else _other_package():
         raise SystemExit(f"error: {line}") if command else ImportError(line)
     if command:
@@ -23,20 +23,20 @@ def begin() -> None:
 
 
 def _other_package() -> str | None:
-    """Find a user's folder `envs/`, or another installed package of that name, that shadows this project's."""
+    """Return an error if a user's folder, e.g. `envs/`, or an installed package hides a package of this project."""
     for name in PACKAGES:
         spec = find_spec(name)
         places = list(spec.submodule_search_locations or [str(spec.origin)]) if spec is not None else []
         if not places:
-            return f"package {name} is missing, it belongs to {HOME / name}; install the project again"
+            return f"package {name} is missing in {HOME / name}; install the project again"
         if Path(places[0]).resolve() != (HOME / name).resolve():
-            remedy = "rename that one, or start the command from another folder"
+            remedy = "rename the first one, or start the command from another folder"
             return f"package {name} is taken from {places[0]}, not from {HOME / name}; {remedy}"
     return None
 
 
 def version() -> str:
-    """Write name and version of this program; from pyproject.toml if it is not installed."""
+    """Return name and version of this program, from pyproject.toml if the program is not installed."""
     try:
         return f"turbidostat-dqn {metadata.version('turbidostat-dqn')}"
     except metadata.PackageNotFoundError:
@@ -45,15 +45,15 @@ def version() -> str:
 
 
 def stopped() -> str:
-    """Write the message of a stop before the start; the run to resume may have left a pump on."""
+    """Return the message of a stop before the start; a run to be resumed may have left a pump on."""
     words = sys.orig_argv
     deploys = any(Path(word).name in ("deploy", "deploy.py", "experiments.deploy") for word in words)
     resumed = deploys and any(word.lstrip("+").startswith("resume=") for word in words)
-    return "stopped before anything began" + "; pumps not verified off: resume the run" * resumed
+    return "stopped before the command started" + "; pumps not verified off: resume the run" * resumed
 
 
 def _shown(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Handle Ctrl-C during the import of a command without a useless traceback."""
+    """Print one line instead of a traceback if Ctrl-C stops the import of a command."""
     if issubclass(kind, KeyboardInterrupt):
         print(stopped(), file=sys.stderr)
     else:

@@ -1,4 +1,4 @@
-"""Stop of a command by Ctrl-C, SIGTERM or SIGHUP, and worker processes that end with it."""
+"""Stop of a command by Ctrl-C, SIGTERM or SIGHUP, and worker processes that end with the command."""
 
 import logging
 import multiprocessing
@@ -23,12 +23,12 @@ log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # signals of a batch system before a job's time limit
 STATUS = 130  # exit status of a stopped command, as in shells for Ctrl-C
-AGAIN_S = 0.1  # after which a lost stop is raised again
+AGAIN_S = 0.1  # time after which a lost stop is raised again
 
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
-    """Let these signals call `handler` in this context, except deliberately ignored ones (nohup)."""
+    """Let these signals call `handler` in this context, except a signal that is ignored on purpose (nohup)."""
     before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
     for number in before:
         signal.signal(number, handler)
@@ -50,7 +50,7 @@ def blocked(*numbers: int) -> Iterator[None]:
 
 
 class _Wait:
-    """State of a stop: whether stops wait, the waiting signal, whether the last stop arrived, and the raised stop."""
+    """State of stops. asked: stops must wait. came: waiting signal. heard: last stop was handled. stop: last stop."""
 
     asked = heard = False
     came = 0
@@ -58,10 +58,10 @@ class _Wait:
 
 
 class _Stop(KeyboardInterrupt):
-    """A raised stop: it exists until it is handled or lost."""
+    """A raised stop. The object exists until the stop is handled or lost."""
 
     def __init__(self) -> None:
-        _Wait.stop = weakref.ref(self)  # here, where no frame of its traceback references it
+        _Wait.stop = weakref.ref(self)  # here, because no frame of the traceback references the stop yet
 
 
 def heard() -> None:
@@ -74,10 +74,10 @@ def _arrives() -> bool:
 
 
 def _interrupt(number: int, stack: FrameType | None) -> None:
-    """Raise a stop, again and again until it arrives.
+    """Raise a stop, and raise it again every `AGAIN_S` until it is handled.
 
-    A handler runs between two steps of any Python code. If C code called that code, it may swallow the exception: NumPy
-    looks up `__array_ufunc__` of an operand, an enum runs Python for it, and NumPy treats an error as absence.
+    A handler runs between two steps of any Python code. If C code called this Python code, the C code may swallow the
+    exception: an enum runs Python when NumPy looks up `__array_ufunc__`, and NumPy takes any error as "no attribute".
     """
     if _Wait.asked:
         _Wait.came = number
@@ -95,7 +95,7 @@ def _interrupt(number: int, stack: FrameType | None) -> None:
 
 @contextmanager
 def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Send the signals of a stop to `handler`; a stop that leaves this context has arrived."""
+    """Send the signals of a stop to `handler`. After this context a raised stop is not raised again."""
     before, _Wait.heard = signal.getsignal(signal.SIGALRM), False
     try:
         with handled(handler, *SIGNALS):
@@ -107,9 +107,9 @@ def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Delay stops in this context, for calls whose lock a KeyboardInterrupt could leave locked.
+    """Delay stops in this context, for a call that could leave a lock locked after a KeyboardInterrupt.
 
-    The next user of that lock, e.g. the writer's close, would wait without limit. Do not nest.
+    The next user of the lock, e.g. the writer's close, would wait without limit. Do not nest.
     """
     _Wait.asked = True
     try:
@@ -123,14 +123,14 @@ def undisturbed() -> Iterator[None]:
 
 @contextmanager
 def interrupts() -> Iterator[None]:
-    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt."""
+    """Raise KeyboardInterrupt on Ctrl-C, SIGTERM (service manager, shutdown of the PC) or SIGHUP (closed terminal)."""
     with _stopping(_interrupt):
         yield
 
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """Raise only the first: later ones do not interrupt the switching off of pumps or the summary."""
+    """Raise KeyboardInterrupt only for the first stop, so that later ones do not interrupt switching off the pumps."""
 
     def answer(number: int, stack: FrameType | None) -> None:
         if _arrives():
@@ -144,7 +144,7 @@ def one_interrupt() -> Iterator[None]:
 
 @contextmanager
 def unmasked() -> Iterator[None]:
-    """Turn an ImportError caused by a stop during the load of an extension module back into a KeyboardInterrupt."""
+    """Raise KeyboardInterrupt instead of the ImportError that a stop causes while a C extension is loading."""
     try:
         yield
     except (ImportError, SystemError) as error:
@@ -157,7 +157,7 @@ def unmasked() -> Iterator[None]:
 
 
 class Pause:
-    """Signals that wait until the work can be saved, and then go to their previous handler.
+    """Handler that keeps signals until the work is saved, and then passes them to their previous handlers.
 
     Args: until: text shown to the user: when the work will stop.
     """
@@ -168,27 +168,27 @@ class Pause:
         self._came: list[int] = []
 
     def __call__(self) -> bool:
-        """Return whether a signal waits."""
+        """Return whether a signal is waiting."""
         return bool(self._came)
 
     def answer(self, number: int, stack: FrameType | None) -> None:
-        """Handle a signal. A second one from the user ends the program at once; a cluster may repeat its own.
+        """Handle a signal. A second one from the user ends the program at once, but not one of a cluster's own signals.
 
-        A worker gets it from the terminal and from its command, which then waits for the worker.
+        A second signal does not end a worker, because a worker gets each stop twice: from terminal and command.
         """
         old = self._before[number]
         ours = number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
         if self._came and ours and multiprocessing.parent_process() is None:
-            print("stopped at once; earlier saved data is complete", file=sys.stderr, flush=True)
+            print("stopped at once; data saved earlier is complete", file=sys.stderr, flush=True)
             os._exit(STATUS)
         if not self._came:
             print(f"stopping {self._until}; a second signal stops at once", flush=True)
         self._came.append(number)
 
     def pass_on(self) -> None:
-        """Pass the signal to its previous handler: a batch system requeues the job, or lets it continue.
+        """Pass the signal to its previous handler. A batch system's handler requeues the job or lets it continue.
 
-        Raises: KeyboardInterrupt without a previous handler, or that handler's exception.
+        Raises: KeyboardInterrupt without a previous handler, or the handler's own exception.
         """
         came, self._came = self._came, []
         for number in dict.fromkeys(came):
@@ -202,7 +202,7 @@ class Pause:
 def pausing(until: str) -> Iterator[Pause]:
     """Let the first signal only set the yielded pause; a second one from the user ends the program at once.
 
-    Use it only for work that can be saved between two steps. Args: as of `Pause`.
+    Use this context only for work that can be saved between two steps. Args: as of `Pause`.
     """
     pause = Pause(until)
     with handled(pause.answer, *SIGNALS, *CLUSTER):
@@ -210,7 +210,7 @@ def pausing(until: str) -> Iterator[Pause]:
 
 
 def _begin_worker() -> None:
-    """Prepare a worker: load the command's extensions; end with the parent, also if it is killed."""
+    """Prepare a worker: load the command's extensions, and end when the parent ends or is killed."""
     extensions.load_all()
     parent = multiprocessing.parent_process()
 
@@ -223,10 +223,10 @@ def _begin_worker() -> None:
 
 
 class Workers(ProcessPoolExecutor):
-    """Spawned worker processes that leave terminal signals to the command; an exception in the context ends them.
+    """Pool of worker processes that leave terminal signals to the command; an exception in the context ends them.
 
-    They are spawned, because a fork copies torch's threads in an arbitrary state.
-    Args: count: of processes; 0 for one per core.
+    The workers are spawned, because a fork would copy torch's threads in an arbitrary state.
+    Args: count: number of processes; 0 for one per core.
     """
 
     def __init__(self, count: int) -> None:
@@ -234,7 +234,7 @@ class Workers(ProcessPoolExecutor):
         super().__init__(count or os.cpu_count() or 1, mp_context=context, initializer=_begin_worker)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Submit as to an executor. A new process inherits the blocked signals."""
+        """Submit a call while terminal signals are blocked, because a new process inherits blocked signals."""
         with blocked(signal.SIGINT, signal.SIGHUP):
             return super().submit(fn, *args, **kwargs)
 

@@ -1,4 +1,4 @@
-"""A sweep: its folder, a record of every job, and the continuation of missing jobs."""
+"""Sweeps: folder of a sweep, record of every job, and continuation of missing jobs."""
 
 import fcntl
 import hashlib
@@ -22,27 +22,27 @@ RECORD, JOB = "sweep.json", "job.json"
 SEARCH = "hparams_search="
 FLAGS = ("-m", "--multirun")
 FOLDER = "hydra.sweep.dir="
-LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # arguments that may differ between starts of a sweep
+LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # arguments that a resumed sweep may change
 
 
 class Busy(Exception):
-    """Error: another process works on this job; the message is one line."""
+    """Error that another process works on this job; its message has one line."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep. folder: of the sweep. command: its command. arguments: as typed, without folder and flag."""
+    """A sweep: its folder, name of its command, and arguments as typed, without the folder and -m."""
 
     folder: Path
     command: str
     arguments: list[str]
 
     def line(self) -> list[str]:
-        """Return the command line with the folder, for workers and later starts."""
-        return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse accepts the flag only in front
+        """Return the arguments of the command line, with the folder, for workers and later starts."""
+        return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse accepts -m only in front
 
     def save(self) -> None:
-        """Save the sweep. Raises: UserError if the folder has another sweep."""
+        """Save the sweep in its folder. Raises: UserError if the folder has another sweep."""
         before = read(self.folder)
         if before and (before.command, _lasting(before.arguments)) != (self.command, _lasting(self.arguments)):
             other = shlex.join([f"experiments.{before.command}", *before.line()])
@@ -60,12 +60,12 @@ def _lasting(arguments: Sequence[str]) -> list[str]:
 
 
 def fresh(command: str) -> Path:
-    """Return a new run folder. Its name has the second and the process number, so it is unique."""
+    """Return a new run folder, unique by the second and the process number in its name."""
     return Path("runs") / command / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"
 
 
 def read(folder: Path) -> Sweep | None:
-    """Read the sweep in a folder, None without one or with a damaged record."""
+    """Read the sweep of a folder; return None if there is no sweep or its record is damaged."""
     try:
         found = json.loads((folder / RECORD).read_text("utf-8"))
         return Sweep(folder, str(found["command"]), [str(a) for a in found["arguments"]])
@@ -76,7 +76,7 @@ def read(folder: Path) -> Sweep | None:
 def asked(given: Sequence[str], command: str) -> Sweep | None:
     """Return the sweep of a command line, None for a single run.
 
-    `resume=SWEEP` continues the sweep in that folder; it may change the launcher.
+    `resume=SWEEP` continues the sweep in this folder; the launcher may be a new one.
     Raises: UserError if other arguments are given, too.
     """
     plain = [a for a in given if a not in FLAGS]
@@ -86,7 +86,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
         others = [a for a in plain if not a.startswith(("resume=", *LATER))]
         if others or before.command != command:
             what = others[0] if others else f"experiments.{command}"
-            raise UserError(f"{what}: a resumed sweep keeps its values; use {before.again()}")
+            raise UserError(f"{what}: not allowed, a resumed sweep keeps its values; use {before.again()}")
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
         kept = [a for a in before.arguments if a.partition("=")[0] not in keys]
@@ -94,7 +94,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
             kept = [a for a in kept if not a.startswith("hydra.launcher.")]
         return Sweep(before.folder, command, kept + new)
     if folder and len(plain) < len(given):
-        raise UserError(f"resume={folder}: no sweep; continue a single run without -m")
+        raise UserError(f"resume={folder}: not a sweep; to continue a single run, drop -m")
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
@@ -110,7 +110,7 @@ def searches(arguments: Sequence[str]) -> bool:
 def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
     """List the overrides of every job, in order; None for a search, whose jobs depend on results.
 
-    Args: arguments: in Hydra's form. Raises: hydra.errors.HydraException for other text.
+    Args: arguments: in Hydra's form. Raises: hydra.errors.HydraException if an argument is not in this form.
     """
     if searches(arguments):
         return None
@@ -128,8 +128,8 @@ def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
 class Job:
     """Content of a job's job.json.
 
-    state: running (or stopped, if no process works on it), finished, failed. config: hash of its config.
-    objective: its return value. error: reason of a failure, one line.
+    state: missing, running, stopped (its process was killed), finished or failed. config: hash of the job's config.
+    objective: return value of the job. error: reason of a failure, one line. overrides: values on its command line.
     """
 
     folder: Path
@@ -141,7 +141,7 @@ class Job:
 
     @classmethod
     def at(cls, folder: Path) -> "Job":
-        """Return the job of a folder, also an incomplete one."""
+        """Return the job of a folder; a job without a readable job.json is missing."""
         try:
             found = json.loads((folder / JOB).read_text("utf-8"))
             return cls(folder, found["state"], found["config"], found["objective"], found["error"])
@@ -155,16 +155,16 @@ class Job:
         files.write_json(self.folder / JOB, kept)
 
     def begin(self, config: Any) -> None:
-        """Begin the job with this config. Raises: UserError if its folder has a run of another config."""
+        """Begin the job with this config. Raises: UserError if its folder has a run with another config."""
         digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
         if self.config not in ("", digest):
-            raise UserError(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
+            raise UserError(f"{self.folder}: has a run with another config; give another {FOLDER}FOLDER")
         self.config = digest
         if self.state != "finished":
             self.save("running")
 
     def put_aside(self) -> None:
-        """Move files of an earlier start that cannot be continued to stopped_1, stopped_2, ..."""
+        """Move the files of an earlier start, which cannot continue, to a folder stopped_1, stopped_2, ..."""
         own = (JOB, ".hydra", ".lock")
         left = [p for p in self.folder.iterdir() if p.name not in own and p.suffix != ".log"]
         left = [p for p in left if not p.name.startswith("stopped_")]
@@ -180,13 +180,13 @@ class Job:
 def working(folder: Path, wait: bool = False) -> Iterator[None]:
     """Exclude other processes from the job of a folder in this context.
 
-    Args: wait: for another process. Raises: Busy without waiting.
+    Args: wait: whether to wait until another process ends. Raises: Busy, without waiting, if another process works.
     """
     with open(folder / ".lock", "w") as lock:
         try:
             fcntl.lockf(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except OSError as error:
-            raise Busy(f"{folder}: another process works on it; wait for its end") from error
+            raise Busy(f"{folder}: another process works on this job; wait until that process ends") from error
         yield
 
 
@@ -203,7 +203,7 @@ def _free(folder: Path) -> bool:
 def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
     """List every job of a sweep with its state, in order of number.
 
-    Args: expected: overrides of all jobs; None: the jobs with a folder.
+    Args: expected: overrides of all jobs; None lists the jobs that have a folder.
     """
     there = sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
     found = (
@@ -217,7 +217,7 @@ def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
 
 
 def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
-    """Describe how many jobs of a sweep finished, and the remedy for the others, in one line."""
+    """Return one line: how many jobs of a sweep finished, and the next command."""
     found = survey(sweep.folder, expected)
     done = sum(job.state == "finished" for job in found)
     line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
@@ -226,11 +226,11 @@ def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
     over = ("finished", "running") if expected is not None else ("finished", "running", "failed")
     if all(job.state in over for job in found):
         return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"
-    return f"{line}; what is missing: {sweep.again()}"
+    return f"{line}; run the missing jobs: {sweep.again()}"
 
 
 def errors(folder: Path, expected: list[list[str]] | None, most: int = 3) -> str:
-    """Describe which jobs failed and why, for the start of a line; empty without failures."""
+    """Return which jobs failed and why, as the start of a line; "" without failures."""
     why: dict[str, list[str]] = {}
     for job in survey(folder, expected):
         if job.state == "failed":

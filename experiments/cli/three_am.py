@@ -1,4 +1,4 @@
-"""The lists of docs/three_am.md, from the declared messages: `python -m experiments.cli.three_am` writes them anew."""
+"""Generator of the lists in docs/three_am.md from the declared messages: `python -m experiments.cli.three_am`."""
 
 import re
 from importlib import import_module
@@ -13,12 +13,12 @@ TABLE = re.compile(r"(<!-- (alarms|notes|errors) of (\S+) -->\n).*?(<!-- end -->
 
 
 def page(text: str) -> str:
-    """Fill the marked lists of a page."""
+    """Return the page with its marked lists filled."""
     return TABLE.sub(lambda m: f"{m[1]}{_lines(m[2], m[3])}\n{m[4]}", text)
 
 
 def declared(what: str, room: str) -> list[type[Message]]:
-    """Messages of one sort that a room declares, in their order there."""
+    """List the messages of one sort (alarms, errors, notes) that a package declares, in order of declaration."""
     module = import_module(f"{room.replace('/', '.')}.messages")
     own = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
     return [one for one in own if issubclass(one, Message) and one.says and _sort(one) == what]
@@ -29,13 +29,13 @@ def _sort(kind: type[Message]) -> str:
 
 
 def _lines(what: str, room: str) -> str:
-    """Write a line per message; an error or note that says all and needs no action has none."""
+    """Return a line for each message, except an error or note that has neither a docstring nor a remedy."""
     told = [one for one in declared(what, room) if what == "alarms" or _meaning(one) or one.remedy]
     return "\n" + "\n".join(_line(one) for one in told if what == "alarms" or re.search(r"\w", _shown(one.says))) + "\n"
 
 
 def _line(kind: type[Message]) -> str:
-    """Write the sentence of a message, the response to a fault, the meaning, and the remedy behind an arrow."""
+    """Return a message's sentence, the response to a fault, the meaning, and the remedy after an arrow."""
     said = f"- `{_shown(kind.says)}`"
     if issubclass(kind, Fault):
         said = f"- `{kind.kind}: {_shown(kind.says)}` ({kind.response})"

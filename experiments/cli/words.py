@@ -1,4 +1,4 @@
-"""Arguments of a command line in Hydra's form, and the error message for invalid ones."""
+"""Conversion of command-line arguments to Hydra's form, with error messages for invalid arguments."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -15,12 +15,12 @@ EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 
 
 class UserError(Message, Exception):
-    """Error that the user can correct; only its message, one line, is shown."""
+    """Error that the user can correct. The program shows only its message, one line."""
 
 
 @contextmanager
 def refusing(*errors: type[Exception], about: str = "") -> Iterator[None]:
-    """Raise these errors as a UserError in this context. Args: about: prefix of their message."""
+    """Raise these errors as a UserError in this context. Args: about: prefix of the message."""
     try:
         yield
     except errors as error:
@@ -34,11 +34,11 @@ def _choose(command: str, group: str, option: str) -> None:
     of = presets.owners(f"{group}/{option}") if option in known else ()
     if of and command not in of:
         what = "recipe" if group == "experiment" else "preset"
-        raise UserError(f"{given}: a {what} of {of[0]}; python -m experiments.{of[0]} +{given}")
+        raise UserError(f"{given}: a {what} of {of[0]}; use python -m experiments.{of[0]} +{given}")
     if group not in own:
         others = [name for name in presets.commands() if group in presets.chosen(name)]
         takes = ", ".join(own) or "no group"
-        raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
+        raise UserError(f"{given}: {command} accepts {takes}; {group}= is for {', '.join(others)}")
     if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
         allowed = ", ".join(presets.options(command, group))
         raise UserError(f"{given}: no such option; allowed: {allowed}")
@@ -48,9 +48,9 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     """Convert arguments to Hydra's form, independent of the YAML files.
 
     `group=option` or `+group=option` selects a preset or a user's YAML file. A task selects its agent, unless another
-    is given. Every other key is forced in, because defaults are in the dataclass and not in YAML; the schema refuses an
-    unknown key. `resume=RUN` makes RUN the run folder; `extend=FILE.py` is loaded on return. Raises: UserError for an
-    unknown group or option, with the accepted ones, and for an unusable file.
+    agent is given. Every other key gets `++`, because the defaults are in the dataclass and not in YAML; the schema
+    later refuses unknown keys. `resume=RUN` makes RUN the run folder. `extend=FILE.py` loads the file.
+    Raises: UserError for an unknown group or option, with the accepted ones, and for an unusable file.
     """
     with refusing(ValueError):
         _without_key(argv, command)
@@ -58,7 +58,7 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
         old = resumed(argv)
         if old:
             if others := [arg for arg in argv if arg.startswith("extend=")]:
-                raise UserError(f"{others[0]}: a resumed run loads its own copy from {old}/extensions; drop it")
+                raise UserError(f"{others[0]}: not allowed, a resumed run loads {old}/extensions; drop this argument")
             extensions.kept(Path(old))
         argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
     extensions.offer()
@@ -82,22 +82,22 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     out += [other for other in belongs if other.partition("=")[0] not in chosen]
     if old:
         if not (Path(old) / "config.yaml").is_file():
-            raise UserError(f"resume={old}: no run folder (it holds no config.yaml); give the folder of a run")
+            raise UserError(f"resume={old}: not a run folder (no config.yaml); give the folder of a run")
         out += [f"{RUN}{old}", "hydra.output_subdir=null"]
     return out
 
 
 def _without_key(argv: Sequence[str], command: str) -> None:
-    """Refuse a word that has no key, naming the key that it may be of. Raises: UserError."""
+    """Refuse an argument without a key and suggest a key for it. Raises: UserError."""
     key = {"calibrate": "data", "certify": "policy", "deploy": "policy", "score": "policy", "train": "env_file"}
     for before, arg in zip(("", *argv), argv, strict=False):
         if "=" not in arg and arg[:1] not in ("-", "~") and before[:1] != "-":
             named = f"{key.get(command, 'run')}={arg}"
-            raise UserError(f"{arg}: values are given as KEY=VALUE; did you mean {named}? See --help")
+            raise UserError(f"{arg}: give values as KEY=VALUE; did you mean {named}? See --help")
 
 
 def _with_preset_files(arg: str) -> str:
-    """Register `group=FILE.yaml` as a preset and return `group=FILE`, also for each file of a sweep."""
+    """Register each file of `group=FILE.yaml,...` as a preset and return `group=FILE,...`."""
     match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml\b.*)$", arg)
     if match is None or match[2] not in presets.groups():
         return arg
@@ -105,7 +105,7 @@ def _with_preset_files(arg: str) -> str:
 
 
 def _engine(group: str, option: str) -> str:
-    """Check that a Hydra launcher is installed. Raises: UserError with the remedy otherwise."""
+    """Check that a Hydra launcher is installed, and return its name. Raises: UserError with the remedy."""
     needs = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit", "slurm": "submitit"}
     if group == "hydra/launcher":
         if option not in ("basic", *needs):
@@ -116,6 +116,6 @@ def _engine(group: str, option: str) -> str:
 
 
 def resumed(argv: Sequence[str]) -> str | None:
-    """Return the run folder to continue in."""
+    """Return the run folder that the last `resume=` names, None without one."""
     given = [arg.removeprefix("resume=") for arg in argv if arg.startswith("resume=") and arg != "resume=null"]
     return given[-1] if given else None

@@ -1,1 +1,1 @@
-"""What a run leaves behind, and reads back: journal, recordings, state, curves, summary, the page after it."""
+"""Output files of a run, written and read back: journal, recordings, state, curves, summary, and its page."""

@@ -1,4 +1,4 @@
-"""After a run: what its model predicted beside what the recordings show, as a section of the run's page."""
+"""Section of a run's page that compares the predictions of its model with the recordings."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -30,14 +30,14 @@ Array = NDArray[np.float64]
 
 DECISION = '"kind":"decision"'
 INCOMPARABLE: list[Callable[[Mapping[str, Any]], str]] = []
-"""From the config of a run to why no model is compared with it, "" where one is; a guest adds its own."""
-ESTIMATES = ("mu", "gain")  # what a controller may believe of culture and pump
+"""Functions of a run's config that return why the run has no model to compare with, or "". A guest adds its own."""
+ESTIMATES = ("mu", "gain")  # estimates of culture and pump that a controller may report
 COLUMNS = ("hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net growth beyond the model's, 1/min")
 
 
 @dataclass(frozen=True)
 class Believed:
-    """The model a run is compared with, where it is from, and whether one that was fitted decided something."""
+    """Model to compare a run with. source: origin of the model. planned: whether the run's controller used it."""
 
     mu: float
     tau: float
@@ -46,7 +46,7 @@ class Believed:
 
 
 def believed(run: Path) -> Believed:
-    """Load the model of the policy, else of the `env_file`, else the nominal one, of a deployment's folder."""
+    """Return the model of a deployment: that of its policy, else that of its `env_file`, else the nominal one."""
     config = _config(run)
     nominal = EnvConfig(tau=_bench(config).tau)
     controller = config.get("controller")
@@ -56,13 +56,13 @@ def believed(run: Path) -> Believed:
             model = policies.load(run / "policy.npz").metadata["model"]
             return Believed(float(model["mu"]), float(model["tau"]), "the policy's training model", True)
         except (policies.PolicyError, KeyError, TypeError, ValueError):
-            pass  # exported without its model, or damaged: another one was believed as well
+            pass  # the policy has no model or is damaged, so the run used another model, too
     if path := config.get("env_file"):
         try:
             env = read_env_file(str(path))
             return Believed(env.mu, env.tau, f"env_file {path}", not learned)
         except frame.UserError:
-            return Believed(nominal.mu, nominal.tau, f"nominal, since env_file {path} cannot be read any more")
+            return Believed(nominal.mu, nominal.tau, f"nominal, because env_file {path} can no longer be read")
     return Believed(nominal.mu, nominal.tau, "nominal")
 
 
@@ -80,9 +80,9 @@ def _config(run: Path) -> Mapping[str, Any]:
 
 
 def decisions(run: Path, reactor: str) -> dict[str, Array]:
-    """Read each decision for a reactor from the journal: `minute`, `supervised` and the controller's estimates.
+    """Read the K decisions for a reactor from the journal: `minute`, `supervised` and the controller's estimates, (K,).
 
-    A key that no decision has is left out; one that some lack is nan there. All of shape (K,).
+    A value is nan for a decision without this key. A key that no decision has is omitted.
     """
     rows = list(_decisions(run / "journal.jsonl", reactor))
     known = [key for name in ESTIMATED for key in (name, f"{name}_sd", f"true_{name}")]
@@ -92,7 +92,7 @@ def decisions(run: Path, reactor: str) -> dict[str, Array]:
 
 
 def _decisions(path: Path, reactor: str) -> Iterator[tuple[float, Mapping[str, Any]]]:
-    """Minute and reasons of every decision for a reactor; a line that a power cut tore is left out."""
+    """Yield minute and explanation of every decision for a reactor; skip a line cut short by a power failure."""
     if not path.is_file():
         return
     with path.open(encoding="utf-8", errors="replace") as f:
@@ -112,9 +112,9 @@ def _real(value: Any) -> float:
 
 
 def write(page: Page, run: Path, label: str = "") -> None:
-    """Add the section of a deployment to a page; its figures are files in RUN/report. Other runs have none.
+    """Add the section of a deployment to a page, and write its figures to RUN/report. Other runs get no section.
 
-    Args: label: how the run is called on a page of several.
+    Args: label: name of the run, if the page shows several runs.
     """
     if not ((run / "recordings").is_dir() and (run / "config.yaml").is_file()):
         return
@@ -130,10 +130,10 @@ def write(page: Page, run: Path, label: str = "") -> None:
     told = "".join(f", {number(tau, 4)} of {name}" for name, tau in own.items())
     growth, tau = number(model.mu, 4), number(model.tau, 4)
     page.text(
-        f"The model: growth {growth} 1/min, tau {tau}{told} ({model.source}). Growth and pump "
-        "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "
-        "beyond the prediction from the one before; it shows also where growth and pump hide one behind the other. A "
-        "value has changed when it is off by 10 % or more and its interval excludes the model's."
+        f"Model: growth {growth} 1/min, tau {tau}{told} ({model.source}). Growth and pump gain are estimated from each "
+        "segment of about two hours alone. Net growth is the growth of each sample beyond the prediction from the "
+        "sample before. Net growth also shows a change where growth and pump gain cannot be told apart. A value has "
+        "changed if it differs by 10 % or more from the model's value and its interval excludes the model's value."
     )
     for path in sorted((run / "recordings").glob("*.csv")):
         known = reactors.get(path.stem) if isinstance(reactors, Mapping) else None
@@ -166,31 +166,31 @@ def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mappin
 
 
 def _facts(found: Agreement) -> list[str]:
-    """Until when what held, and how well the next sample was predicted."""
+    """List how long each value of the model was right, and how well the model predicted the next sample."""
     facts = [f"{c.name}: {_fact(c)}" for c in (found.growth, found.gain, found.net)]
-    gap = f"{found.rms:.4f} OD; {found.attainable:.4f} OD without the error of net growth"
-    return [*facts, f"the next sample was predicted within {gap} (rms)"]
+    best = f"{found.attainable:.4f} OD without the error of net growth"
+    return [*facts, f"rms error of the predicted next sample: {found.rms:.4f} OD; {best}"]
 
 
 def _fact(c: Compared) -> str:
-    """Compare the last estimate with the model's value, and say how the estimates drift."""
+    """Compare the last estimate with the model's value, and describe the drift of the estimates."""
     if c.latest is None:
         return "not identifiable"
-    last = f"last {_shown(c.latest)}, the model's {number(c.expected)}"
+    last = f"last estimate {_shown(c.latest)}, model {number(c.expected)}"
     if c.left_min is not None:
-        last += f", which has not held since hour {c.left_min / 60:.1f}"
+        last += f", wrong since hour {c.left_min / 60:.1f}"
     elif not c.latest.low <= c.expected <= c.latest.high:
-        last += "; its interval excludes that, but in too few segments or by less than 10 %"
+        last += "; the interval excludes the model's value, but in too few segments or by less than 10 %"
     if c.line is not None and c.line.significant and c.expected > 0.0:
-        last += f"; a line through the segments changes by {c.line.change_pct:+.0f} %"
+        last += f"; trend over all segments {c.line.change_pct:+.0f} %"
     return last
 
 
 def _sure(why: Mapping[str, Array]) -> list[str]:
-    """How often an estimate was as near to the truth as it said, where the truth is known."""
+    """List how often each estimate was within two of its standard deviations of the truth, where that is known."""
     names = {"error": "error e", "growth_share": "growth share s"}
     found = {key: values[np.isfinite(values)] for key, values in within_2sd(why).items()}
-    within = "within two of its own sd of the truth in"
+    within = "within two standard deviations of the truth in"
     return [
         f"{names[key]}: {within} {100.0 * values.mean():.0f} % of {values.size} decisions"
         for key, values in found.items()
@@ -206,7 +206,7 @@ def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
         for kind, t in (reasons.items() if isinstance(reasons, Mapping) else ())
         if isinstance(t, Mapping) and {"rows", "first_min", "last_min"} <= t.keys()
     )
-    interlock = f"The interlock spoke in {summary.get('interlock', 0)} of {summary.get('rows', 0)} rows"
+    interlock = f"The interlock had alarms in {summary.get('interlock', 0)} of {summary.get('rows', 0)} rows"
     acted = f"A supervisor acted on {len(supervised)} rows"
     if len(supervised):
         acted += f", {span(supervised[0], supervised[-1])}"

@@ -1,4 +1,4 @@
-"""A closed loop in TensorBoard, while it runs and at its end."""
+"""TensorBoard curves of a closed loop, during the run and at its end."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ WINDOW = {
 
 
 class Curves:
-    """Curves of N reactors over minutes of the run: one reactor's in the run folder, several in reactors/NAME/.
+    """Curves of N reactors over minutes of the run, in the run folder for one reactor, in reactors/NAME/ for several.
 
     Points carry run time, so the axes "relative" and "wall" show culture hours, even for a simulation of seconds.
 
     Args:
-      folder: run folder. names: of the reactors. columns: that the recordings have.
-      first_minute: of a resumed run, or 0.
-      began: when the run began, s since 1970; None: now.
+      folder: run folder. names: names of the reactors. columns: columns of the recordings.
+      first_minute: minute at which a run is resumed, else 0.
+      began: start of the run, s since 1970; None: now.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Curves:
         self.run.flush()
 
     def step(self, step: Step) -> None:
-        """One point of every curve of the reactors that have a new sample. Raises: OSError of a full disk."""
+        """Add a point to every curve of the reactors with a new sample. Raises: OSError if the disk is full."""
         setpoint = np.where(step.phase >= 0, step.setpoint, np.nan)
         named: dict[str, Array] = {
             "culture/od": step.od if step.believed is None else np.where(step.believed, step.od, np.nan),
@@ -71,7 +71,7 @@ class Curves:
     def end(self, summary: Mapping[str, Any], row: Mapping[str, float | str], pictures: Mapping[str, Path]) -> None:
         """Write the results: figures, the windows as a table, and a row of the HPARAMS table.
 
-        Args: summary: content of summary.json. row: that row but its results. pictures: name -> PNG.
+        Args: summary: content of summary.json. row: values of this row without results. pictures: name -> PNG.
         """
         when = self._began + 60.0 * self._last
         for name, path in pictures.items():
@@ -82,7 +82,7 @@ class Curves:
         self.run.hyper_parameters(row, self._folder)
 
     def flush(self) -> None:
-        """Make everything so far visible to a reader. Raises: OSError of a full disk."""
+        """Write all points so far to the disk, where TensorBoard reads them. Raises: OSError if the disk is full."""
         for events in {self.run, *self._each}:
             events.flush()
 
@@ -109,7 +109,7 @@ def _results(summary: Mapping[str, Any]) -> dict[str, float]:
 
 
 def windows_table(windows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the windows of a summary in Markdown, with the errors of further signals."""
+    """Return the windows of a summary as a Markdown table, with the errors of further signals."""
     of_signals = {f"{s}_abs_error_mean": f"error of the {CALLED.get(s, s)}" for s in signals_in(windows)}
     titles = {key: title for key, title in (WINDOW | of_signals).items() if any(key in w for w in windows)}
     rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in titles] for w in windows]

@@ -1,8 +1,8 @@
-"""What a closed loop leaves behind: a journal, one CSV per reactor, the loop's state, TensorBoard events.
+"""Output files of a closed loop: a journal, one CSV per reactor, the loop's state, TensorBoard events.
 
-Order of writing, so that nothing is lost and nothing is done twice: the decision goes into the journal before the
-dose; the dose's intent too (by the driver); after it the row goes into the CSV and the state into state.json. A run
-that is killed in between is completed from the journal when it is resumed.
+The order of writing prevents lost rows and repeated doses. Before a dose, the journal gets the decision, and the
+driver's intent to dose. After the dose, the CSV gets the row, and state.json gets the state. If the run is killed in
+between, the next start completes the row from the journal.
 """
 
 import contextlib
@@ -31,10 +31,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """The recordings of a run side by side.
+    """Recordings of all N reactors of a run.
 
-    names: of the reactors. columns: NAME -> (N, K); shorter recordings end in nan. rows: of each reactor, with what the
-    interlock said. repairs: what was mended. marks: what somebody did at the bench, in order of time.
+    names: names of the reactors. columns: column name -> values, (N, K); a shorter recording ends in nan. rows: rows
+    and alarms of each reactor. repairs: messages of repairs. marks: events marked at the bench, in order of time.
     """
 
     names: tuple[str, ...]
@@ -44,11 +44,11 @@ class Recordings:
     marks: Sequence[Mark]
 
     def od(self, refused: bool = False) -> Array:
-        """OD, nan where the interlock did not believe it, or, if `refused`, where it did; (N, K)."""
+        """Return the OD, (N, K), nan where the interlock rejected it; if `refused`, nan where it accepted it."""
         return np.where((self.columns["believed"] == 0.0) == refused, self.columns["od"], np.nan)
 
     def setpoints(self) -> Array:
-        """Setpoint of the OD, nan in a recovery, which has none; (N, K)."""
+        """Return the setpoint of the OD, (N, K), nan during a recovery, which has no setpoint."""
         return np.where(self.columns["phase"] >= 0, self.columns["setpoint"], np.nan)
 
 
@@ -56,10 +56,10 @@ class Record:
     """Journal, recordings, state and events of one run.
 
     Args:
-      folder: run folder; an existing run in it is continued. names: of the reactors.
-      fsync: each row on the disk before the call returns, and its curves visible. columns: of the recordings.
-    Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
-      mended on opening.
+      folder: run folder; an existing run in it is continued. names: names of the reactors.
+      fsync: whether a call returns only after its row and curves are on the disk. columns: of the recordings.
+    Attributes: journal: written by the driver, too. state_path: path of state.json. columns: of the recordings.
+      rows: rows of each reactor. repairs: messages of the repairs on opening.
     Raises: RecordingError.
     """
 
@@ -88,10 +88,10 @@ class Record:
         self.curves = Curves(self.folder, self.names, columns, round(newest) + 1, began)
 
     def complete(self) -> None:
-        """Write what the end of the loop kept from being written, as the journal has it: rows, and what doses came to.
+        """Complete the recordings from the journal after the end of the loop: missing rows, corrected dose volumes.
 
-        What was written is read from the disk, because a signal may have come between a row and the memory of it.
-        Raises: RecordingError.
+        The rows are read from the disk again, because a signal may have come after a row was written and before it was
+        kept in memory. Raises: RecordingError.
         """
         self.rows, journal = [read_rows(path, self.columns) for path in self._paths], self.journal.reread()
         complete(journal, self.names, self.rows, self._write)
@@ -109,7 +109,7 @@ class Record:
         self.rows[n].append(row)
 
     def decided(self, step: Step) -> None:
-        """Journal every decision of a step before anything is dosed, with how the controller came to it."""
+        """Write every decision of a step into the journal before any dose, with the controller's explanation."""
         for n in range(len(self.names)):
             if step.rows[n]:
                 why = {key: value[n] for key, value in step.explanation.items()}  # a number, or an MPC's plan
@@ -119,7 +119,7 @@ class Record:
                 self.journal.append("trouble", {"reactor": self.names[n], "interlock": step.reasons[n]})
 
     def done(self, step: Step, state: Mapping[str, Any]) -> None:
-        """Write a step's rows, the state after it, and its curves. Raises: RecordingError when the disk refuses."""
+        """Write a step's rows, the state after the step, and its curves. Raises: RecordingError if the disk fails."""
         for n in map(int, np.flatnonzero(step.rows)):
             self._write(n, row_of(step, n))
             if (path := self._paths[n]) not in self._gone and self._recorders[n].gone:
@@ -134,7 +134,7 @@ class Record:
             raise NotWritten(path=self.folder, why=error.strerror or error) from error
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Replace state.json; it includes the rows of the journal before its `journal_row`."""
+        """Replace state.json. The new state includes all rows of the journal before `journal_row`."""
         content = {"journal_row": self.journal.next_row, **state}
         files.write_json(self.state_path, content, self._fsync, indent=None)
 
@@ -160,5 +160,5 @@ class Record:
         for recorder in self._recorders:
             recorder.close()
         self.journal.close()
-        with contextlib.suppress(OSError):  # on a full disk the last points of the curves are lost, no row is
+        with contextlib.suppress(OSError):  # a full disk loses the last points of the curves, but no row
             self.curves.close()

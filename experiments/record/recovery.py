@@ -1,6 +1,6 @@
-"""The rows of a recording, and what a resumed run takes over: rows, those never written, the loop's state.
+"""Rows of a recording, and recovery of a run: its written rows, its missing rows, the state of its loop.
 
-The journal is written before everything else, so whatever the other files lack can be had from it.
+The journal is written before all other files, so it has everything that the other files lack.
 """
 
 import bisect
@@ -38,7 +38,7 @@ COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
 )  # fmt: skip
-KEPT = ("decision", "closed")  # rows of the journal that say what is in a row of a recording
+KEPT = ("decision", "closed")  # kinds of journal rows whose doses are in a row of a recording
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -65,7 +65,7 @@ def row_of(step: Step, n: int) -> Row:
 
 @dataclass
 class Reason:
-    """A reason of the interlock: in how many rows, and the minutes of the first and the last of them."""
+    """One kind of interlock alarm: number of rows with it, minutes of the first and of the last of these rows."""
 
     rows: int
     first_min: float
@@ -73,10 +73,10 @@ class Reason:
 
 
 class Rows:
-    """All rows of one reactor's recording: the numbers by column, and what the interlock said.
+    """All rows of one reactor's recording: numbers by column, and alarms of the interlock.
 
-    Args: columns: of the recording, `COLUMNS` and maybe more behind them.
-    Attributes: names, of the columns; columns, the numbers; alarms, in how many rows it spoke; reasons, by kind.
+    Args: columns: names of the recording's columns: `COLUMNS`, perhaps followed by others.
+    Attributes: names: of the columns. columns: name -> numbers. alarms: number of rows with alarms. reasons: by kind.
     """
 
     def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
@@ -89,7 +89,7 @@ class Rows:
         return len(self.columns["time_min"])
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Take a row. Raises: ValueError for a cell that is no number, KeyError for a missing one."""
+        """Add a row. Raises: ValueError for a cell that is not a number, KeyError for a missing cell."""
         for key, column in self.columns.items():
             column.append(float(row[key]))
         self.alarms += bool(row["interlock"])
@@ -99,19 +99,19 @@ class Rows:
             reason.rows, reason.last_min = reason.rows + 1, minute
 
     def last(self) -> dict[str, float]:
-        """Return the numbers of the newest row; none for an empty recording."""
+        """Return the numbers of the newest row, {} for an empty recording."""
         return {key: column[-1] for key, column in self.columns.items()} if len(self) else {}
 
 
 def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
-    """Read the rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
+    """Read the rows of a recording with these columns. Raises: RecordingError for a damaged row."""
     found, line = Rows(columns), 1
     try:
         with open(path, newline="", encoding="utf-8") as f:
             for raw in (rows := csv.DictReader(f)):
                 line = rows.line_num
                 if raw.keys() != set(columns) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
-                    raise ValueError("a row without a time, or not with a cell for every column")
+                    raise ValueError("a row has no time, or not one cell for every column")
                 found.append({key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
     except OSError as error:
         raise messages.RecordingUnreadable(path=path, why=error.strerror) from None
@@ -123,10 +123,10 @@ def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
 def complete(
     journal: Sequence[Mapping[str, Any]], names: Sequence[str], rows: Sequence[Rows], write: Callable[[int, Row], None]
 ) -> list[Message]:
-    """Write the rows of each reactor that are in the journal and that a kill kept from being written.
+    """Write each reactor's rows that are in the journal but, after a kill, not in the recording.
 
-    Args: journal: its rows. rows: of each reactor, those already written, into which `write` takes each new one.
-    Returns: one message per row. Raises: RecordingError for a row of the journal that was damaged.
+    Args: journal: rows of the journal. rows: written rows of each reactor; `write` must add each new row to them.
+    Returns: one message for each new row. Raises: RecordingError for a damaged row of the journal.
     """
     repairs = list[Message]()
     for n, name in enumerate(names):
@@ -141,10 +141,10 @@ def complete(
 
 
 def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
-    """Sum the mL of each decision for a reactor, by its row of the journal, oldest first.
+    """Return the volume fed by each decision for a reactor, number of its journal row -> mL, oldest first.
 
-    A dose belongs to the decision before it, its repetitions to the next one, or at the end of a life of the run to the
-    last one (`closed`). Raises: RecordingError.
+    A dose belongs to the decision before it. A repeated dose belongs to the decision after it, or to the last decision
+    if the program ended (row `closed`) before another one. Raises: RecordingError.
     """
     decided, closed = ([r["n"] for r in journal if r.get("reactor") == name and r["kind"] == k] for k in KEPT)
     found = dict.fromkeys(decided, 0.0)
@@ -158,15 +158,15 @@ def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]
 
 
 def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
-    """Correct the last row of reactor `name`, if its dose was cut short or repeated after it; else None.
+    """Return the corrected last row of reactor `name` if its dose was cut short or repeated later, else None.
 
-    Args: journal: up to the end of this life of the run, with a row `closed`. rows: as written, with the dose as it was
-      planned. Raises: RecordingError.
+    Args: journal: rows up to the end of this start of the program, with a row `closed`. rows: the written rows, with
+      the dose as planned. Raises: RecordingError.
     """
     decisions = [r for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
     if not decisions or not len(rows) or rows.last()["time_min"] != decisions[-1]["row"]["time_min"]:
         return None
-    earlier = np.nansum(rows.columns["volume_ml"][:-1])  # with what the rows after them corrected
+    earlier = np.nansum(rows.columns["volume_ml"][:-1])  # each row includes corrections of the row before it
     given = sum(volumes(journal, name).values()) - float(earlier)
     if abs(given - rows.last()["volume_ml"]) <= 1e-6:
         return None
@@ -174,7 +174,7 @@ def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row |
 
 
 def _kept(row: Mapping[str, Any], column: str) -> float | int | str | bool | None:
-    """Return a cell of a decision; nan where there is none."""
+    """Return a cell of a decision's row, nan for an empty cell."""
     value: float | int | str | bool | None = row[column]
     return math.nan if value is None else value
 
@@ -196,9 +196,9 @@ def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> I
 
 
 def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
-    """Build the row of a sample after which the program was killed before it decided: no dose.
+    """Build the row of a sample, with no dose, if the program was killed after the sample and before a decision.
 
-    Args: rows: those before it.
+    Args: rows: earlier rows of the reactor.
     """
     time, before = round(float(sample["time_s"]) / 60.0, 4), rows.last()
     row: Row = dict.fromkeys(rows.columns, math.nan)
@@ -215,9 +215,9 @@ def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
 
 
 def load_state(path: Path) -> dict[str, Any]:
-    """Load state.json; `journal_row` is the first row of the journal that it does not include.
+    """Load state.json. The state includes all rows of the journal before its `journal_row`.
 
-    Raises: RecordingError where there is none to resume from.
+    Raises: RecordingError if there is no state to resume from.
     """
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
@@ -226,7 +226,7 @@ def load_state(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise messages.NoState(path=path, why=f"not JSON: {error}") from None
     if not isinstance(state, dict):
-        raise messages.NoState(path=path, why=f"it holds {str(state)[:40]}, expected keys and values")
+        raise messages.NoState(path=path, why=f"the file has {str(state)[:40]}, expected keys and values")
     known = state.get("journal_row", "missing")
     if type(known) is not int or known < 0:
         raise messages.NoState(path=path, why=f"journal_row: {str(known)[:40]}, expected the number of a row")
@@ -234,9 +234,9 @@ def load_state(path: Path) -> dict[str, Any]:
 
 
 def is_over(journal: Journal, path: Path) -> bool:
-    """Whether every reactor of a run was done or given up, and its pumps verified off since.
+    """Return whether every reactor of a run is done or given up, and the pumps were verified off after that.
 
-    Args: path: of state.json. Raises: RecordingError.
+    Args: path: path of state.json. Raises: RecordingError.
     """
     state, ends = load_state(path), [row for row in journal.rows if row["kind"] in ("start", "stop")]
     done, stopped = (state.get(key) for key in ("done", "stopped"))
@@ -246,12 +246,12 @@ def is_over(journal: Journal, path: Path) -> bool:
 
 
 def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence[Rows] = ()) -> None:
-    """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
+    """Restore the loop from its saved state, and book the doses and hand-overs that began after it was saved.
 
-    Those doses are told to the controller too, and what the driver has put off to the next dose since then.
+    The controller also gets these doses, and the volume that the driver has since then deferred to the next dose.
 
-    Args: journal: of the run. path: of state.json. rows: of the recordings.
-    Raises: RecordingError for a state that is damaged or does not fit.
+    Args: journal: journal of the run. path: path of state.json. rows: rows of the recordings.
+    Raises: RecordingError for a state that is damaged or does not fit the run.
     """
     state = load_state(path)
     doses = [dose for dose in dosed(journal.rows) if dose.n >= state["journal_row"]]
@@ -276,9 +276,9 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
         pump = np.where(mine, dose.pump or FEED.pump, FEED.pump)
         loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s, pump)
-        if dose.n > decided.get(dose.reactor, -1):  # what came before the newest decision is in its position already
+        if dose.n > decided.get(dose.reactor, -1):  # the newest decision's position includes all earlier doses
             loop.supply.given(pump, mine * dose.feed_ml)
-        if dose.again and dose.n > written.get(dose.reactor, -1):  # in no row yet
+        if dose.again and dose.n > written.get(dose.reactor, -1):  # no row has this dose yet
             loop.repeated_ml += mine * dose.feed_ml
     before = [row for row in journal.rows if row["n"] < state["journal_row"]]
     kept_ml = _put_off(journal.rows, loop) - _put_off(before, loop)
@@ -292,7 +292,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence
 
 
 def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: list[str]) -> dict[str, Any]:
-    """Advance every schedule of a state to the newest decision that the state does not include."""
+    """Return a state with every schedule advanced to the newest decision in these rows of the journal."""
     found = dict(state)
     for row in rows:
         if row["kind"] == "decision" and isinstance(row.get("position"), Mapping) and row.get("reactor") in names:
@@ -304,6 +304,6 @@ def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: 
 
 
 def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:
-    """Return what the driver last put off to the next dose by these rows of a journal, mL, (N,)."""
+    """Return the volume that the driver last deferred to the next dose in these journal rows, mL, (N,)."""
     last = {row["reactor"]: float(row["carry_ml"]) for row in rows if row["kind"] == "intent"}
     return np.array([last.get(name, 0.0) for name in loop.reactors.names])

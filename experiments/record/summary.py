@@ -1,4 +1,4 @@
-"""What a run says: changes while it runs; at its end metrics of every window, totals of every reactor, the figure."""
+"""Log of a run's changes, and summary at its end: metrics of every window, totals of every reactor, a figure."""
 
 import logging
 import re
@@ -31,9 +31,9 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 class ChangeLog:
-    """Log changes once: phases, who decides, alarms of the interlock; and notes of the reactors, once an hour.
+    """Logger of changes: phases, interlock alarms, policy or supervisor. It repeats notes of reactors once an hour.
 
-    Args: loop: that is watched. tell: called for alarms and hand-overs, too: event, text, reactor.
+    Args: loop: loop to watch. tell: function of event, text and reactor, also called for alarms and hand-overs.
     """
 
     def __init__(self, loop: ClosedLoop, tell: Callable[[str, str, str], None] | None = None) -> None:
@@ -43,7 +43,7 @@ class ChangeLog:
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
-        self._noted: dict[str, tuple[float, float]] = {}  # when a kind of note was last said, its largest number then
+        self._noted: dict[str, tuple[float, float]] = {}  # note -> time of its last log line, largest number in it
         self._error, self._samples = np.zeros(len(self._names)), np.zeros(len(self._names))  # of the window so far
 
     def __call__(self, step: Step) -> None:
@@ -67,7 +67,7 @@ class ChangeLog:
                     self._samples[n] += 1
             reason = step.reasons[n] or ""
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
-                continue  # what a sample was refused for is not over because there is no new one yet
+                continue  # an alarm of the last sample lasts until there is a new sample
             named = kinds_of(reason)
             kinds = " ".join(k for k in named if k != FilterAlarm.kind) if named else reason
             if kinds != (self._reason[n] or ""):
@@ -81,7 +81,7 @@ class ChangeLog:
         self.notes(step.now_s, step.notes)
 
     def notes(self, now_s: float, notes: Sequence[str]) -> None:
-        """Log notes; repeat one that differs only in numbers after an hour, or if its largest number has doubled."""
+        """Log notes; repeat a note, with new numbers or not, after an hour or when its largest number has doubled."""
         for note in notes:
             kind, largest = NUMBER.sub("#", note), max(map(float, NUMBER.findall(note)), default=0.0)
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))
@@ -102,7 +102,7 @@ class ChangeLog:
         self._error[n] = self._samples[n] = 0.0
 
     def _who_decides(self, step: Step, n: int) -> None:
-        """Where a supervisor stands over the policy: from when on its law acts, and until when."""
+        """Log when the supervisor's controller replaces the policy, and when the policy acts again."""
         supervised = bool(step.explanation.get("supervised", np.zeros(len(self._names)))[n])
         if supervised != self._supervised[n]:
             self._supervised[n] = supervised
@@ -120,9 +120,9 @@ def reasons_line(rows: Rows) -> str:
 def summarise(
     table: Recordings, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str, progress: Progress
 ) -> dict[str, Any]:
-    """Every number of a run.
+    """Return the content of summary.json.
 
-    Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended.
+    Args: scenarios, roles: one per reactor. outcome: how the run ended. progress: times at which the steps ended.
     """
     volume, minute = np.nansum(table.columns["volume_ml"], axis=1), table.columns["time_min"]
     reactors = {
@@ -147,7 +147,7 @@ def summarise(
 
 
 def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
-    """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
+    """Return the metrics of every phase of every reactor; `ended` is what ended the phase, null for an open phase."""
     elapsed, od = table.columns["elapsed_min"], table.od()
     rows = []
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
@@ -165,9 +165,9 @@ def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progres
 
 
 def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, Any]:
-    """How well reactor n's further signals, as estimated and, where it is known, in truth, and its OD followed.
+    """Return the errors of reactor n's OD and further signals, by the estimate and, where known, by the truth.
 
-    A signal has a column NAME, maybe true_NAME, and NAME_setpoint; None where none or more than one was asked for.
+    A signal has the columns NAME, NAME_setpoint and perhaps true_NAME. Its setpoint is None unless it was constant.
     """
     own = {key: values[n : n + 1] for key, values in table.columns.items()}
     minute = own["elapsed_min"]
@@ -187,7 +187,7 @@ def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, A
 
 
 def figure_of(table: Recordings, scenarios: Sequence[Scenario], title: str) -> Figure:
-    """OD over setpoint, pump rate and, where a scenario changes it, temperature of all reactors."""
+    """Draw the OD, setpoint, pump rate and, if a scenario changes it, temperature of all reactors."""
     c = table.columns
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = c["temperature_degc"].T if switched else None

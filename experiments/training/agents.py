@@ -1,4 +1,4 @@
-"""Agents in their environments: `build` makes agents of a registered kind, `population` groups of them that train."""
+"""Registry of agents. `build` makes agents of a registered kind, `population` makes groups of agents that train."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -21,28 +21,28 @@ PARTS = (
     "config", "network", "n_agents", "steps", "updates", "act", "observe", "curves", "state_dict", "load_state_dict",
 )  # fmt: skip
 Streams = Mapping[str, Sequence[np.random.SeedSequence]]
-"""By name, one per agent."""
+"""Random streams: name of the stream -> one stream for each agent."""
 
 
 class AgentKind(NamedTuple):
-    """Function that makes agents from config, task, streams and device, and its stream names."""
+    """Kind of agent. make: function of config, task, streams and device. streams: names of its random streams."""
 
     make: Callable[[Any, Task, Streams, str], Agent]
     streams: tuple[str, ...]
 
 
 def _dqn(config: DQNConfig, task: Task, streams: Streams, device: str) -> DQNAgent:
-    """Make deep Q-learners. Raises: ValueError if they never learn, or if the inputs are those of another task."""
+    """Make deep Q-learners. Raises: ValueError if they would never learn, or if their inputs do not fit the task."""
     if config.learn_start >= config.total_steps:
         raise ValueError(
             f"agent.learn_start = {config.learn_start}: allowed 0 to {config.total_steps - 1}, below "
-            "agent.total_steps; learning starts after it"
+            "agent.total_steps, because learning starts after this step"
         )
     width, seen = np.size(config.input_matrix) // max(1, len(config.input_offset)), len(task.observation)
     if width not in (0, seen):
         raise ValueError(
-            f"agent.input_matrix has rows of {width} numbers, this task observes {seen} "
-            f"({', '.join(task.observation)}): choose the agent of the task, which has its name (agent=relative for "
+            f"agent.input_matrix has rows of {width} numbers, but this task observes {seen} numbers "
+            f"({', '.join(task.observation)}); choose the agent of the same name as the task (agent=relative for "
             "env=relative), or agent=paper"
         )
     return DQNAgent(config, seen, task.actions.size, streams, task.hindsight(config), device)
@@ -57,12 +57,12 @@ def add(
     """Register an agent as `train agent=KIND`.
 
     Args:
-      kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`; with `total_steps`.
-      make: called with config, task, streams and device.
-      streams: names of its random streams.
+      kind: name of the agent; `config` has a field `kind` with this default.
+      config: dataclass of the agent's values, each made by `conf.schema.setting`; needs a field `total_steps`.
+      make: function of config, task, streams and device that makes the agents.
+      streams: names of the agent's random streams.
       what: sentence in the help.
-    Raises: ValueError for a kind that exists.
+    Raises: ValueError if the kind exists already.
     """
     if kind in AGENTS:
         raise NameTaken(what="agent", name=kind)
@@ -71,21 +71,21 @@ def add(
 
 
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
-    """Make one agent per seed of each stream.
+    """Make as many agents as each stream has seeds.
 
-    Raises: ValueError for a config that does not fit the task, or an agent that lacks a method of `Agent`.
+    Raises: ValueError if the config does not fit the task, or if the agent lacks an attribute of `Agent`.
     """
     made = KINDS[type(config)].make(config, task, streams, device)
     if missing := [part for part in PARTS if not hasattr(made, part)]:
-        raise ValueError(f"agent {config.kind} has no {', '.join(missing)} (docs/extending.md, An agent)")
+        raise ValueError(f"agent {config.kind} lacks {', '.join(missing)}; see docs/extending.md, An agent")
     return made
 
 
 def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.random.SeedSequence]]:
-    """Make for each name one SeedSequence per seed, independent of the other names and seeds.
+    """Make for each name one SeedSequence per seed. All of them are independent.
 
-    The stream of a name depends on its seed and its place in `names` only, so agent i of a population has the same
-    streams as a single agent with its seed. Append new names at the end.
+    A SeedSequence depends only on the seed and on the name's place in `names`, so agent i of a population has the same
+    streams as a single agent with this seed. Append new names at the end.
     """
     spawned = [np.random.SeedSequence(seed).spawn(len(names)) for seed in seeds]
     return {name: [children[k] for children in spawned] for k, name in enumerate(names)}
@@ -94,20 +94,20 @@ def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.ran
 def population(
     task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
 ) -> Population:
-    """Make agents with the given seeds in groups of a suitable size; arguments as `Population`."""
+    """Make agents with the given seeds in groups of a suitable size. Args: threads: as of `Population`."""
     size = GROUP if device == "cpu" else len(seeds)
     groups = [seeds[k : k + size] for k in range(0, len(seeds), size)]
     return Population([trainer(task, agent, group, device) for group in groups], threads)
 
 
 def trainer(task: Task, agent: Any, seeds: Sequence[int], device: str = "cpu") -> Trainer:
-    """Make one group of agents with the given seeds, each with its own environment; one record per episode."""
+    """Make a trainer of one agent per seed, each in its own environment, with one record per episode."""
     own = streams(seeds, (*KINDS[type(agent)].streams, "env"))
     return Trainer(task.copies(own["env"]), build(agent, task, own, device), interval=task.episode_steps)
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:
-    """Turn weights (S, P) into greedy policies on NumPy grids."""
+    """Return the greedy policies of weights (S, P), as a function on NumPy arrays."""
     network = network.with_weights(flat)
 
     def act(observation: np.ndarray) -> np.ndarray:

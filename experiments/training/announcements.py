@@ -1,4 +1,4 @@
-"""Messages of a training run: task and limits at the start, progress, result at the end."""
+"""Messages of a training run: task and limits at the start, then progress, then the result."""
 
 import logging
 import shlex
@@ -21,15 +21,15 @@ log = logging.getLogger(__name__)
 
 
 def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, step: int) -> None:
-    """Log the task, its limits, and where to watch. Args: step: first step of a resumed run, else 0."""
+    """Log the task, its limits, and how to watch the training. Args: step: first step of a resumed run, else 0."""
     chosen = choices(folder)
     names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
     where = f"continues at step {step} of" if step else "for"
     who = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} agents, seeds {seeds[0]} to {seeds[-1]}"
     log.info("learns %s: %s; %s, %s %d steps", names, task.description, who, where, config.agent.total_steps)
     limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} at rest"
-    log.info("target: a policy within %s at its worst setpoint (regret: its cost beyond the exact optimum's)", limits)
-    log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
+    log.info("target: a policy within %s at its worst setpoint (regret: cost above that of the exact optimum)", limits)
+    log.info("writes to %s; watch the training with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 
 
 def _pair(regret: Array, steady: Array, unit: str) -> str:
@@ -37,9 +37,9 @@ def _pair(regret: Array, steady: Array, unit: str) -> str:
 
 
 def progress(step: int, total: int, seconds: float, score: Score, best: tuple[Array, Array], task: Task) -> str:
-    """Describe the medians over agents on the selection grid, current and kept, and the remaining time.
+    """Describe the remaining time, and the medians over the agents' current and kept policies on the selection grid.
 
-    Args: seconds: of training so far. best: regret and steady error of the kept policies, (S,) each.
+    Args: seconds: training time so far. best: regret and steady error of the kept policies, (S,) each.
     """
     left = seconds / max(step, 1) * (total - step)
     now = _pair(score.regret_pct, score.steady_abs_error, task.unit)
@@ -53,8 +53,8 @@ def ended(
 ) -> None:  # fmt: skip
     """Log the result and the next step.
 
-    Args: told: as on the run's page. spent: steps, updates and time, as text. words: of the next command line. whole:
-    the training did all its steps.
+    Args: told: result as on the run's page. spent: steps, updates and time, as text. words: arguments for the next
+    command. whole: whether the training did all its steps.
     """
     log.info("%s", spent)
     for line in () if told is None else filter(None, (*told.items, told.remark)):
@@ -63,14 +63,14 @@ def ended(
     if task.tried:
         file = shlex.quote(str(path))
         good = (kept.regret_pct <= task.regret_unit) & (kept.steady_abs_error <= task.steady_unit)
-        if task.provable and whole and good.any():  # a certificate is rare beyond the limits, or at them
+        if task.provable and whole and good.any():  # a policy outside the limits or just at them seldom gets one
             log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
         said = " ".join(filter(None, (words, task.tried.format(file))))
         log.info("next, try it: python -m experiments.deploy %s", said)
 
 
 def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path) -> None:
-    """Write the custom page of TensorBoard and the configuration, at the start."""
+    """Write TensorBoard's custom page and the config at the start of a run."""
     writer.events.layout(TRAINING if len(seeds) == 1 else of_population(TRAINING))
     path = folder / "config.yaml"
     if path.is_file():
@@ -89,7 +89,7 @@ def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Seque
 
 
 def results(writer: PopulationWriter, step: int, kept: Score, task: Task, seeds: Sequence[int]) -> None:
-    """Write the final HPARAMS table and text page."""
+    """Write the results to TensorBoard's HPARAMS table and text page."""
     for events, regret, steady in zip(writer.agents, kept.regret_pct, kept.steady_abs_error, strict=False):
         events.scalars({"result/regret_pct": float(regret), "result/steady_abs_error": float(steady)}, step)
     limits = ("limit", f"{task.regret_unit:g}", f"{task.steady_unit:g}")

@@ -1,4 +1,4 @@
-"""The config of a training run. Free of torch."""
+"""Config of a training run, and registries of its tasks and agents. This module does not load torch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, 
 
 @dataclass(frozen=True)
 class TaskKind:
-    """How a task is made of its config, and what it makes of a training run's config.
+    """Kind of task.
 
-    make: called with the config, returns a `Task` (`experiments/training/tasks.py`).
-    completed: reads the files that the run's config names; None: `env_file` is a calibrated.yaml, which replaces env.
-    repeats: keys of the run's config that `deploy` has, too, and is to be told alike.
+    make: function that returns a `Task` (`experiments/training/tasks.py`) for the task's config.
+    completed: function that fills a run's config from its files; None: `env_file` is a calibrated.yaml for env.
+    repeats: keys of the run's config whose values `deploy` needs, too.
     """
 
     make: Callable[[Any], Any]
@@ -30,7 +30,7 @@ class TaskKind:
 
 
 TASKS: dict[type[Any], TaskKind] = {}
-"""By the class of their config."""
+"""Class of a task's config -> kind of task."""
 
 
 def add(
@@ -41,14 +41,14 @@ def add(
     completed: Callable[["TrainConfig"], "TrainConfig"] | None = None,
     repeats: tuple[str, ...] = (),
 ) -> None:
-    """Make a task known as `train env=KIND`.
+    """Register a task as `train env=KIND`.
 
     Args:
-      kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      what: the sentence that the help shows; "": it has a preset of conf/, whose words are shown.
-      task, completed, repeats: as of `TaskKind`.
-    Raises: ValueError for a kind that exists.
+      kind: name of the task; `config` has a field `kind` with this default.
+      config: dataclass of the task's values, each made by `conf.schema.setting`.
+      what: sentence in the help; "" if a preset in conf/ has the sentence.
+      task, completed, repeats: as `make`, `completed` and `repeats` of `TaskKind`.
+    Raises: ValueError if the kind exists already.
     """
     if kind in ENVS:
         raise NameTaken(what="env", name=kind)
@@ -58,7 +58,7 @@ def add(
 
 
 def env_schema(kind: str, key: str = "env") -> Any:
-    """Return the default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
+    """Return the default config of an environment of this kind. Raises: ValueError with all known kinds."""
     if kind not in ENVS:
         raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(ENVS))
     return ENVS[kind]()
@@ -68,7 +68,7 @@ AGENTS: dict[str, type[Any]] = {"dqn": DQNConfig}
 
 
 def agent_schema(kind: str, key: str = "agent") -> Any:
-    """Return the default config of an agent of this kind, "": dqn. Raises: ValueError naming the kinds there are."""
+    """Return the default config of an agent of this kind, "" for dqn. Raises: ValueError with all known kinds."""
     if (kind or "dqn") not in AGENTS:
         raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(AGENTS))
     return AGENTS[kind or "dqn"]()
@@ -76,13 +76,13 @@ def agent_schema(kind: str, key: str = "agent") -> Any:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """`python -m experiments.train`. Raises: ValueError with key, value and allowed range."""
+    """Config of a training run. Raises: ValueError with key, value and allowed range."""
 
     env: Any = part(EnvConfig, "the training model and its episodes", env_schema)
     agent: Any = part(DQNConfig, "the agent's hyper-parameters", agent_schema)
     env_file: str | None = setting(
         None,
-        "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env. For other tasks as their page says",
+        "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env. Other tasks: see their pages",
     )
     seed: int = setting(0, "seed of the first agent", at_least=0)
     n_agents: int = setting(1, "number of agents, with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
@@ -96,7 +96,7 @@ class TrainConfig:
     stop_within: float | None = setting(
         None,
         "stop when the kept policies of all agents are within this multiple of the task's limits on the selection grid "
-        "(env=sim: 0.5 % regret, 0.003 OD steady error); null: never",
+        "(limits of env=sim: 0.5 % regret, 0.003 OD steady error); null: never",
         above=0.0,
     )
     checkpoint_every: int = setting(1000, "steps between checkpoints", "steps", at_least=1)

@@ -1,4 +1,4 @@
-"""The paper's task for a training run: from OD and setpoint (and the next one) to a pump rate, mu and tau known."""
+"""Density tasks of a training run: the policy chooses a pump rate from OD and setpoint(s); mu and tau are known."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,11 +19,11 @@ from envs.vector_env import BioreactorVectorEnv
 from experiments.reporting import charts
 from experiments.training.evaluation import Array, Rollout, beside_optimum, pairs
 
-COARSE = 2e-3  # of log OD, for a figure
+COARSE = 2e-3  # grid spacing of log OD for a figure
 
 
 class DensityTask:
-    """The task of density control; `Task` describes arguments and errors of every method."""
+    """The paper's task of density control; `Task` describes the arguments and errors of every method."""
 
     observation: tuple[str, ...] = ABSOLUTE
     unit = "OD"
@@ -31,7 +31,7 @@ class DensityTask:
     provable = True
     steady_steps = 30
     regret_unit, steady_unit = 0.5, 0.003
-    """Half a per cent of cost is invisible in a recording, and 0.003 OD is the noise of the sensor."""
+    """Half a per cent of the cost is invisible in a recording, and 0.003 OD is the noise of the sensor."""
     tried = "controller=dqn policy={}"
 
     def __init__(self, config: EnvConfig) -> None:
@@ -51,18 +51,18 @@ class DensityTask:
         return GoalRelabel(agent, (min(setpoints), max(setpoints)), tracking_reward)
 
     def selection_grid(self) -> Array:
-        """Return 20 start ODs x setpoints."""
+        """Return every pair of 20 start ODs and the setpoints, (G, 2)."""
         return self._grid(np.linspace(0.1125, 1.0875, 20))
 
     def report_grid(self) -> Array:
-        """Return linspace(0.1, 1.1, 41) x setpoints."""
+        """Return every pair of 41 start ODs from 0.1 to 1.1 and the setpoints, (G, 2)."""
         return self._grid(np.linspace(*SCORED_OD, 41))
 
     def _grid(self, starts: Array) -> Array:
         return pairs(starts, np.unique(self.config.setpoints))
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance x <- f_a x; the error is x - setpoint."""
+        """Advance the OD, x <- f_a x with the factor f_a of action a; return the observation and x - setpoint."""
         setpoint = observation[..., 1]
         od = np.minimum(observation[..., 0] * self._factors[action], MAX_OD)
         return np.stack([od, setpoint], axis=-1), od - setpoint
@@ -79,16 +79,16 @@ class DensityTask:
         return Rollout(state, state - setpoint, action)
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """Return argmin_a |f_a x - s|."""
+        """Return the action a that minimises |f_a x - setpoint|, with the OD factor f_a of one step."""
         after = observation[..., :1] * self._factors
         return np.asarray(np.abs(after - observation[..., 1:]).argmin(axis=-1))
 
     def model(self) -> dict[str, Any]:
-        """Return the control period and the whole model."""
+        """Return the control period and all values of the model."""
         return {"control_min": self.config.control_min, "model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Draw the pump rate over OD and setpoint, and the OD over time from both ends of the starts."""
+        """Draw the pump rate over OD and setpoint, and the OD over time from the lowest and the highest start."""
         env = self.config
         od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
         x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
@@ -99,16 +99,16 @@ class DensityTask:
         return {"policy_map": charts.policy_map(od, setpoint, learned, best), **self._trajectories(policy, start)}
 
     def _trajectories(self, policy: Policy, start: Array) -> dict[str, Figure]:
-        """Draw the OD over time from starts beside the optimum's."""
+        """Draw the OD over time under the policy and under the optimum, from the given starts."""
         minutes = np.arange(self.steps + 1, dtype=np.float64) * self.config.control_min
         ours, theirs, *rates = beside_optimum(policy, self, start)
         return {"trajectories": charts.trajectories(minutes, ours, theirs, self.asked(start), *rates)}
 
 
 def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp]:
-    """Return the optimum's first action of an episode from each OD towards each setpoint, (G,), (G,) -> (G,).
+    """Return the optimum's first action for each pair of start OD and setpoint, (G,), (G,) -> (G,).
 
-    The model is linear in x, so the best action depends only on x / setpoint, and one solution is enough.
+    The model is linear in the OD, so the best action depends only on OD / setpoint, and one solution is enough.
     """
     lowest = float(setpoint.min())
     scaled = od * lowest / setpoint
@@ -116,11 +116,11 @@ def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp
     return solve_episode(wide, lowest, COARSE).act(scaled, env.episode_steps)
 
 
-_optimum = lru_cache(maxsize=16)(solve_episode)  # all grids of a run have the same setpoints
+_optimum = lru_cache(maxsize=16)(solve_episode)  # all grids of a run share the same setpoints
 
 
 class Preview(DensityTask):
-    """The same with the next setpoint known ahead."""
+    """Density task in which the policy knows the next setpoint ahead."""
 
     config: PreviewConfig
     observation: tuple[str, ...] = PREVIEW
@@ -153,11 +153,11 @@ class Preview(DensityTask):
         return self._changes(0.5 * (setpoints[1:] + setpoints[:-1]) if setpoints.size > 2 else setpoints)
 
     def report_grid(self) -> Array:
-        """List changes between each two of the setpoints."""
+        """Return starts for the changes from every setpoint to every other one, (G, 4)."""
         return self._changes(np.unique(self.config.setpoints))
 
     def _changes(self, setpoints: Array) -> Array:
-        """Cultures at rest when the change is announced."""
+        """Return starts at rest at one setpoint when the change to another is announced, (G, 4)."""
         now, following = (a.ravel() for a in np.meshgrid(setpoints, setpoints, indexing="ij"))
         differ = now != following
         time = np.full(int(differ.sum()), self.config.preview_min)
@@ -173,7 +173,7 @@ class Preview(DensityTask):
         return start[:, 2]
 
     def best(self, start: Array) -> Rollout:
-        """By backward induction over the program of each start."""
+        """Solve the setpoint program of each start by backward induction."""
         programs = program_of(self.config.control_min, start[:, 1:], self.steps)
         runs = [solve_episode(self.config, p).rollout(od) for p, od in zip(programs.T, start[:, :1], strict=True)]
         state, action = (np.stack(part, axis=-1) for part in zip(*runs, strict=True))

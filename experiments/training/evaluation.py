@@ -1,4 +1,4 @@
-"""Score of a policy on its task: noise-free rollouts on a grid, compared with the optimum."""
+"""Scores of policies on a task: noise-free rollouts from a grid of starts, compared with the optimum."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from dqn.policy import Policy
 
 Array = NDArray[np.float64]
 Act = Callable[[Array], NDArray[np.intp]]
-"""Observations (S, G, O) -> action indices (S, G)."""
+"""Function of observations, (S, G, O), that returns action indices, (S, G)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """Values of each step, shape (K, S, G): `action`, and after it `state` (the first observation) and `error`."""
+    """Rollout of K steps, arrays (K, S, G): `action`, and after it `state` (the first number observed) and `error`."""
 
     state: Array
     error: Array
@@ -25,10 +25,10 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Per agent, shape (S,): cost J, regret in per cent of the optimum's, steady error at the worst setpoint.
+    """Score of S agents. cost: J, (S,). regret_pct: cost above the optimum's, in per cent of it, (S,).
 
-    steady_by_setpoint: the same at each setpoint (value of `asked`), shape (S, M).
-    mean_abs_error: over all steps and starts, shape (S,).
+    steady_by_setpoint: steady error at each of M setpoints (values of `asked`), (S, M).
+    mean_abs_error: mean |error| over all steps and starts, (S,).
     """
 
     cost: Array
@@ -38,15 +38,15 @@ class Score:
 
     @property
     def steady_abs_error(self) -> Array:
-        """Largest steady error over the setpoints, shape (S,): a lab sees an offset at a single setpoint."""
+        """Largest steady error over the setpoints, (S,), because an offset at a single setpoint matters in a lab."""
         return np.asarray(self.steady_by_setpoint.max(axis=-1))
 
 
 class Evaluated(Protocol):
-    """Task as an evaluation needs it.
+    """Part of a task that an evaluation needs.
 
-    steps: of a rollout; steady_steps: last steps, used for the steady error. arrived: error below which the optimum is
-    at rest.
+    steps: number of steps of a rollout. steady_steps: number of last steps that give the steady error.
+    arrived: error below which the optimum counts as at rest.
     """
 
     steps: int
@@ -54,29 +54,30 @@ class Evaluated(Protocol):
     arrived: float
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Return the observation after one step, (..., O), and the error whose square is its cost, (...)."""
+        """Return the observation after one step, (..., O), and the error, (...); the step's cost is its square."""
 
     def asked(self, start: Array) -> Array:
-        """Return the value by which steady errors are grouped, e.g. the setpoint, (G,), for starts (G, O)."""
+        """Return the value that groups steady errors, e.g. the setpoint, (G,), of starts (G, O)."""
 
     def best(self, start: Array) -> Rollout:
-        """Solve each episode from starts (G, O); the optimum is the only policy (S = 1) of the rollout."""
+        """Return the optimum's rollout from starts (G, O), with S = 1."""
 
 
 def pairs(first: Array, second: Array) -> Array:
-    """Return every pair of two lists of numbers, the first slowest, (A B, 2)."""
+    """Return every pair of numbers of two lists, (A B, 2); the second number changes fastest."""
     return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def each(policy: Policy) -> Act:
-    """Use a policy file as the only policy (S = 1) of a rollout."""
+    """Return a policy file as the only policy (S = 1) of a rollout."""
     return lambda observation: policy.act(observation[0])[None]
 
 
 def beside_optimum(policy: Policy, task: Any, start: Array) -> tuple[Array, Array, Array, Array]:
     """Run a policy file and the optimum from starts (G, O).
 
-    Returns: the first number observed, with the start, (K + 1, G), and the value of the action, (K, G), of both each.
+    Returns: first numbers observed by the policy and by the optimum, with the start, (K + 1, G) each; their action
+      values, (K, G) each.
     """
     runs = rollout(each(policy), task, start[None]), task.best(start)
     ours, theirs = (np.concatenate([start[:, 0][None], run.state[:, 0]]) for run in runs)
@@ -84,7 +85,7 @@ def beside_optimum(policy: Policy, task: Any, start: Array) -> tuple[Array, Arra
 
 
 def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
-    """Run the noise-free closed loop of S policies from G starts. Args: act: the policies. start: (S, G, O)."""
+    """Run S policies without noise from G starts. Args: act: the policies. start: first observations, (S, G, O)."""
     shape = (task.steps, *start.shape[:-1])
     run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
     observation = start
@@ -96,14 +97,13 @@ def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
 
 
 class Evaluation:
-    """Score of policies on one grid against the optimum of the same model, actions, starts and steps.
+    """Scorer of policies on one grid, against the optimum of the same model, actions, starts and steps.
 
-    J = mean over the grid of sum over the steps of error^2 taken after each step (without the error of the start);
-    regret_pct = 100 (J / J* - 1); steady_abs_error = the largest over the setpoints of the median over starts and last
-    `steady_steps` of |error|. A start is ignored if the optimum has not arrived by then: its error exceeds `arrived`
-    and that from the best start. E.g. a slow pump does not dilute 1.1 to 0.2 in time.
-
-    Args: task: to score. start: observations at the start, (G, O).
+    J = mean over the grid of the sum over the steps of error^2 after each step (without the error at the start).
+    regret_pct = 100 (J / J* - 1). The steady error of a setpoint is the median of |error| over its starts and the last
+    `steady_steps` steps. It ignores starts from which the optimum is not at rest by then, e.g. if a slow pump cannot
+    dilute 1.1 to 0.2 in time: the optimum's error exceeds `arrived` and that from the best start.
+    Args: task: task to score. start: observations at the start, (G, O).
     """
 
     def __init__(self, task: Evaluated, start: Array) -> None:

@@ -1,4 +1,4 @@
-"""The task in relative coordinates for a training run: from error and growth share to a pump rate."""
+"""Relative task of a training run: the policy chooses a fraction of full pump from error and growth share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -19,14 +19,14 @@ from experiments.training.evaluation import Array, Rollout, beside_optimum, pair
 
 
 class Relative:
-    """The relative task; `Task` describes arguments and errors of every method."""
+    """The relative task; `Task` describes the arguments and errors of every method."""
 
     observation: tuple[str, ...] = RELATIVE
     unit = "periods of full pump"
     arrived = 0.1  # periods of full pump
     provable = True
     regret_unit, steady_unit = 0.01, 0.1
-    """The steady error is half the spacing of the levels and hardly distinguishes policies; regret does."""
+    """The steady error, half the spacing of the levels, hardly differs between policies; the regret does."""
 
     steps, steady_steps = 100, 30
     scalars: Mapping[str, float] = {}
@@ -37,7 +37,7 @@ class Relative:
         self.episode_steps = config.episode_steps
         self.description = "growth takes {:g} to {:g} of the largest pump rate".format(*config.growth_shares)
         self.actions = config.levels()
-        # Beyond the largest error of training the policy sees that error: full pump or none is also right there.
+        # Larger errors than in training are shown to the policy as the largest one: full pump or none is right there.
         span = config.largest_error - 0.05
         low, high = config.growth_shares
         self.limits = (np.array([-span, low]), np.array([span, high]))
@@ -49,21 +49,21 @@ class Relative:
         return ShiftRelabel(agent, self.config.largest_error, relative_reward)
 
     def selection_grid(self) -> Array:
-        """Return 20 errors x 25 growth shares."""
+        """Return every pair of 20 errors and 25 growth shares, (G, 2)."""
         return self._grid(20, 25, 0.3)
 
     def report_grid(self) -> Array:
-        """Return 41 errors x 48 growth shares."""
+        """Return every pair of 41 errors and 48 growth shares, (G, 2)."""
         return self._grid(41, 48, 0.5)
 
     def _grid(self, errors: int, shares: int, place: float) -> Array:
-        """Return midpoints (or other places) of equal cells, so that grids share no point."""
+        """Return one point in each of equal cells, at `place` (0 to 1), so that two grids share no point."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         e = span * (2.0 * (np.arange(errors) + place) / errors - 1.0)
         return pairs(e, low + (high - low) * (np.arange(shares) + place) / shares)
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance e <- e + s - v; the error is e."""
+        """Advance the error, e <- e + s - v with growth share s and pump level v; return the observation and e."""
         s = observation[..., 1]
         error = observation[..., 0] + s - self.actions[action]
         return np.stack([error, s], axis=-1), error
@@ -80,15 +80,15 @@ class Relative:
         return Rollout(error, error, action)
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """Choose the level nearest to e + s."""
+        """Return the index of the pump level nearest to e + s."""
         return nearest_level(observation[..., 0], observation[..., 1], self.actions.size)
 
     def model(self) -> dict[str, Any]:
-        """Describe the range of growth shares of the training."""
+        """Return the config of the training, with its range of growth shares."""
         return {"model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Draw the fraction of the largest pump rate over error and growth share, and the error over time."""
+        """Draw the pump level over error and growth share, and the error over time."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         error, share = np.linspace(-span, span, 241), np.linspace(low, high, 97)
         e, s = (a.ravel() for a in np.meshgrid(error, share))

@@ -1,4 +1,4 @@
-"""One training run from its config to its output files: a policy per agent, figures and summary.json."""
+"""One training run, from its config to its output files: a policy per agent, figures and summary.json."""
 
 import hashlib
 import json
@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 
 
 def train(config: TrainConfig, folder: Path) -> float:
-    """Train, export and report; returns the objective of a sweep: the merit of the worst seed.
+    """Train, export and report; return the merit of the worst seed, which is the objective of a sweep.
 
-    Merit is that of `session.merit` on the selection grid: 1 is the limit of the task, lower is better. The reported
-    grid is not used to choose hyper-parameters.
+    The merit is `session.merit` on the selection grid: 1 is at the task's limits, and lower is better. The reported
+    grid does not influence the choice of hyper-parameters.
     """
     if (whole := _completed(config)) is not config:
         config = whole
@@ -41,7 +41,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
     if isinstance(config.env, EnvConfig):
         _warn_of_growth(config.env)
-    torch.set_num_threads(1)  # per operation: small matrices do not gain from more
+    torch.set_num_threads(1)  # threads of one operation: small matrices do not gain from more
     try:
         with frame.refusing(ValueError):
             session = Session(config, folder, resume=config.resume is not None)
@@ -67,7 +67,7 @@ def _warn_of_growth(env: EnvConfig) -> None:
     if step_factors(env).min() >= 1.0:
         log.warning(
             "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g a setpoint needs more than mu tau = %.4g mL/s, "
-            "and env.max_pump_rate = %g mL/s. Raise env.max_pump_rate, or check mu and tau",
+            "but env.max_pump_rate = %g mL/s. Raise env.max_pump_rate, or check mu and tau",
             env.mu, env.tau, env.mu * env.tau, env.max_pump_rate,
         )  # fmt: skip
 
@@ -119,7 +119,7 @@ def fingerprint(config: TrainConfig) -> str:
 
 
 def _export(session: Session, score: Score) -> tuple[Path, Policy]:
-    """Write every agent's best policy to policies/ and the best agent's to policy.npz; return that one and its file."""
+    """Write every agent's best policy to policies/, the best of all to policy.npz; return policy.npz and its policy."""
     c, best, task = session.config, session.best, session.task
     folder = session.folder / "policies"
     folder.mkdir(exist_ok=True)
@@ -148,7 +148,7 @@ def _figures(session: Session, exported: Policy) -> None:
     best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
     returns = np.array(session.returns)
-    ended = ~np.isnan(returns).all(axis=1)  # no episode ends in the rest of the last interval
+    ended = ~np.isnan(returns).all(axis=1)  # a last, shorter interval has no finished episode
     curves = (returns[ended], history[:, 0], history[:, 1:], best.step.astype(float))
     drawn = {"learning": charts.learning(*curves), **session.task.figures(exported)}
     for name, figure in drawn.items():

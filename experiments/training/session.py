@@ -1,4 +1,4 @@
-"""One training run: agents, evaluation, records, and checkpoints to continue from, to the bit on one processor."""
+"""One training run: agents, evaluation, records, checkpoints. On one processor a run resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from experiments.training.tasks import Task
 
 log = logging.getLogger(__name__)
 
-LINES = 20  # between progress lines without a terminal
+LINES = 20  # number of progress lines without a terminal
 PER_AGENT = ("merit", "regret", "steady", "step", "updates")  # arrays of `BestSoFar`, (S,)
 
 
 def merit(score: Score, task: Task) -> NDArray[np.float64]:
-    """Return the merit of a policy, (S,), lower is better: the larger of regret and steady error in units.
+    """Return the merit of S policies, (S,): the larger of regret and worst steady error, each over the task's limit.
 
-    Regret alone does not show a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost. The steady
-    error is that of the worst setpoint.
+    A lower merit is better. Regret alone does not show a small steady error: 0.006 OD for a whole episode is 0.1 % of
+    the episode's cost.
     """
     return np.maximum(score.regret_pct / task.regret_unit, score.steady_abs_error / task.steady_unit)
 
@@ -45,23 +45,23 @@ class BestSoFar:
 
     weights: torch.Tensor  # (S, P)
     merit: NDArray[np.float64]  # (S,)
-    regret: NDArray[np.float64]  # per cent, of the best by merit, (S,)
-    steady: NDArray[np.float64]  # OD, likewise
-    step: NDArray[np.int64]  # (S,)
-    updates: NDArray[np.int64]  # gradient steps until then, (S,)
+    regret: NDArray[np.float64]  # per cent, of these weights, (S,)
+    steady: NDArray[np.float64]  # steady error of these weights, in the task's unit, (S,)
+    step: NDArray[np.int64]  # step of these weights, (S,)
+    updates: NDArray[np.int64]  # gradient steps up to these weights, (S,)
     history: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
-    """Step, regret_pct and steady_abs_error of every evaluation, per agent."""
+    """Every evaluation: its step, and regret_pct and steady_abs_error of each agent."""
 
     @classmethod
     def empty(cls, weights: torch.Tensor) -> BestSoFar:
-        """Return a record without scores; `weights` (S, P) count until the first score."""
+        """Return a record without scores that keeps `weights`, (S, P), until the first evaluation."""
         n = weights.shape[0]
         worst = np.full((3, n), np.inf)
         step, updates = np.zeros((2, n), dtype=np.int64)
         return cls(weights.cpu().clone(), worst[0], worst[1], worst[2], step, updates)
 
     def update(self, step: int, updates: int, score: Score, value: NDArray[np.float64], weights: torch.Tensor) -> None:
-        """Keep what has a lower merit `value`, (S,), than before."""
+        """Keep the weights and score of every agent whose merit `value`, (S,), is lower than before."""
         self.history.append((step, score.regret_pct.tolist(), score.steady_abs_error.tolist()))
         better = value < self.merit
         for i in better.nonzero()[0]:
@@ -83,12 +83,12 @@ class BestSoFar:
 
 
 class Session:
-    """Parts and accumulated results of one training run.
+    """One training run: its parts, and the results so far.
 
     Args:
-      config: of the training. folder: run folder, for events, progress.csv and checkpoint.pt.
-      resume: continue from the folder's checkpoint.
-    Raises: dqn.checkpoint.CheckpointError without a checkpoint to continue from.
+      config: config of the training. folder: run folder, for events, progress.csv and checkpoint.pt.
+      resume: whether to continue from the folder's checkpoint.
+    Raises: dqn.checkpoint.CheckpointError if there is no checkpoint to continue from.
     """
 
     def __init__(self, config: TrainConfig, folder: Path, resume: bool = False) -> None:
@@ -99,8 +99,8 @@ class Session:
         self.agents = agents.population(self.task, config.agent, self.seeds, config.device, config.threads)
         self.selection = Evaluation(self.task, self.task.selection_grid())
         self.best = BestSoFar.empty(self.agents.weights())
-        self.returns: list[list[float]] = []  # per episode, per agent
-        self.seconds = 0.0  # spent training, including earlier starts
+        self.returns: list[list[float]] = []  # a row per episode, with the return of each agent
+        self.seconds = 0.0  # training time, including that before a resume
         if resume:
             state = checkpoint.load(folder / "checkpoint.pt")
             self.agents.load_state_dict(state["agents"])
@@ -110,7 +110,7 @@ class Session:
         announcements.show(self.writer, config, self.task, self.seeds, folder)
 
     def evaluate(self, step: int) -> Score:
-        """Score the greedy policies on the selection grid, keep the best, log."""
+        """Score the greedy policies on the selection grid, keep the best ones, and log the scores."""
         weights = self.agents.weights()
         score = self.selection(agents.act_with(self.agents.network, weights), self.agents.n_agents)
         self.best.update(step, self.agents.updates, score, merit(score, self.task), weights)
@@ -129,7 +129,7 @@ class Session:
 
     @property
     def ended(self) -> str:
-        """Reason of the end, for messages."""
+        """Reason why the training ended, for messages."""
         within = self.config.stop_within
         if within is None or not self.met():
             return "agent.total_steps"
@@ -138,14 +138,14 @@ class Session:
         return f"every kept policy is within {limits} on the selection grid"
 
     def _news(self, record: TrainRecord) -> str:
-        """Describe the medians over agents on the selection grid, current and kept; "" before an update."""
+        """Evaluate the policies and describe their progress; before the first update say that they are untrained."""
         if not record.updates and record.step < self.config.agent.total_steps:
             return "untrained: no update yet"
         score, kept = self.evaluate(record.step), (self.best.regret, self.best.steady)
         return announcements.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
     def report(self) -> tuple[Evaluation, Score, Score]:
-        """Score the kept policies and the last iterates on the reported grid."""
+        """Return the evaluation on the reported grid, the scores of the kept policies, and those of the last ones."""
         report = Evaluation(self.task, self.task.report_grid())
         kept, last = (
             report(agents.act_with(self.agents.network, weights), self.agents.n_agents)
@@ -174,10 +174,10 @@ class Session:
         checkpoint.save(self.folder / "checkpoint.pt", state)
 
     def run(self) -> None:
-        """Train to the end, or until the limits are met: log every episode, evaluate, checkpoint, show progress.
+        """Train to the end, or until `stop_within` is met: log every episode, evaluate, checkpoint, show progress.
 
-        Raises: KeyboardInterrupt after a signal, with a checkpoint of the running episode. A batch system's own handler
-        may end the job or let it continue.
+        Raises: KeyboardInterrupt after a signal, once the running episode has ended and is saved. A batch system's own
+        handler may end the job or let it continue.
         """
         c = self.config
         if self.met():  # resumed after the end

@@ -1,4 +1,4 @@
-"""Tasks of a training run; `of` returns the task of an environment's config."""
+"""Tasks of a training run. `of` returns the task for the config of an environment."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -24,12 +24,12 @@ from experiments.training.relative import Relative
 class Task(Evaluated, Protocol):
     """Task of an agent: environment, scores, export.
 
-    config: of the environment, of any class. observation: O names, as in the policy file. actions: the grid, (A,).
-    limits: of the observation in the policy file, low and high, each (O,). regret_unit, steady_unit: per cent of cost
-    and steady error of equal weight in a comparison of policies. episode_steps: of a training episode.
-    description: numbers of the model, for the log. scalars: the same for TensorBoard's table of runs.
-    provable: whether `certify` can prove its closed loop.
-    tried: arguments with which `deploy` runs a policy of this task, {} for its file; "" if it cannot.
+    config: config of the environment, of any class. observation: names of the O inputs, as in the policy file.
+    actions: values of the A actions, (A,). limits: lowest and highest observation for the policy file, (O,) each.
+    unit: unit of the error. regret_unit, steady_unit: limits of regret (per cent) and steady error for a good policy.
+    episode_steps: steps of a training episode. description: the model's numbers, for the log. scalars: the same for
+    TensorBoard's table of runs. provable: whether `certify` can prove the closed loop of a policy of this task.
+    tried: arguments with which `deploy` runs such a policy, {} for the file; "" if `deploy` cannot run it.
     """
 
     config: Any
@@ -49,22 +49,22 @@ class Task(Evaluated, Protocol):
         """Return one copy of the environment per seed."""
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Return the relabelling of replayed transitions with new goals."""
+        """Return the object that gives replayed transitions new goals."""
 
     def selection_grid(self) -> Array:
         """Return the starts, (G, O), for the comparison of policies during training."""
 
     def report_grid(self) -> Array:
-        """Return the reported grid; it shares no point with `selection_grid`."""
+        """Return the starts, (G, O), for the reported scores; they share no point with `selection_grid`."""
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """Choose the action with the smallest next error (one-line controller), (..., O) -> (...)."""
+        """Return the action with the smallest next error (the one-line controller), (..., O) -> (...)."""
 
     def model(self) -> dict[str, Any]:
-        """Describe the model of the training, for the policy's file."""
+        """Return the training model, for the metadata of the policy file."""
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Draw the policy map and example trajectories beside the optimum's."""
+        """Draw the policy map, and example trajectories of the policy and of the optimum."""
 
 
 TASKS |= {
@@ -73,7 +73,7 @@ TASKS |= {
 
 
 def kind(config: Any) -> str:
-    """Return the registered name of an environment's config."""
+    """Return the registered kind of an environment's config."""
     return next(name for name, known in ENVS.items() if known is type(config))
 
 

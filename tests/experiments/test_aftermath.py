@@ -63,9 +63,9 @@ def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
     assert len(re.findall(of + ".*?the predicted net growth is off by 10 % or more since hour", text)) == 2
     assert "ecalibrate" not in text  # nobody fitted the nominal model
     # in the first two hours growth is off by 6 % in the mean, in the next two by 18 %
-    hours = re.findall(r"10 % or more since hour ([\d.]+)|which has not held since hour ([\d.]+)", text)
+    hours = re.findall(r"10 % or more since hour ([\d.]+)|wrong since hour ([\d.]+)", text)
     assert [float(since or on) for since, on in hours] == pytest.approx([2.0] * 4, abs=0.2)
-    assert "The interlock spoke in 0 of" in text
+    assert "The interlock had alarms in 0 of" in text
     assert "A supervisor acted on 0 rows." in text
     for name in ("M0", "M1"):
         assert (copy / "report" / f"{name}.svg").is_file()
@@ -118,7 +118,7 @@ def test_the_model_is_the_runs(copy, tmp_path):
     assert (believed(copy).mu, believed(copy).tau, believed(copy).source) == (0.02, 0.4, f"env_file {fitted}")
     fitted.unlink()
     assert believed(copy).mu == 0.03
-    assert "cannot be read any more" in believed(copy).source
+    assert "can no longer be read" in believed(copy).source
     own = inverse_policy()
     policies.save(copy / "policy.npz", replace(own, metadata={**own.metadata, "model": {"mu": 0.025, "tau": 0.3}}))
     assert believed(copy).mu == 0.03  # another controller's run has nothing from it

@@ -203,7 +203,7 @@ def test_what_does_not_go_with_a_plant_file_is_one_line(file: str, overrides: li
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "No such file or directory"), ("", "holds no key: value pairs"), ("- 1\n", "holds no key: value pairs"),
+        (None, "No such file or directory"), ("", "no key: value pairs"), ("- 1\n", "no key: value pairs"),
         ("mu: 0.03\ntau: 0.3\n", "plant.mu: no such key"), ("a: &a 1\nb: *a\n", "an alias"),
         ("growth: {mu: 7}\n", "plant.growth.mu = 7.0 1/min: allowed 0 to 0.1"),
         ("growth: {knots_min: [0, 5], knots_mu: [0.01]}\n", "plant.growth.knots_mu = .*one value for each"),

@@ -63,7 +63,7 @@ def refused(run: Rehearsal, *said: str) -> None:
     [
         ("{", "not JSON"),
         ("[" * 100_000, "not JSON"),
-        ("[]", "it holds [], expected keys and values"),
+        ("[]", "the file has [], expected keys and values"),
         (lambda s: s.pop("journal_row"), "journal_row: missing, expected the number of a row"),
         (lambda s: s.update(journal_row=True), "journal_row: True, expected"),
         (lambda s: s.update(began=5), "loop.began has shape (), this run needs (1,)"),
@@ -84,7 +84,7 @@ def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str
         state = json.loads(path.read_text())
         change(state)
         path.write_text(json.dumps(state))
-    refused(run, f"{path}: no state to resume from ({why}", "journal and recordings are kept; start a new run, or put")
+    refused(run, f"{path}: no state to resume from ({why}", "restore the file as the run wrote it, or start a new run")
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_journal_row_that_was_damaged(run: Rehearsal, kind: str, change: Chang
         (lambda rows: [rows[0], b"\xff\xfe,1\n"], "damaged near line 1"),
         (lambda rows: [*rows[:2], b"x" * 50 + b"\n"], "damaged near line 3"),
         (lambda rows: [*rows[:2], rows[2].replace(b",0,", b",high,", 1)], "damaged near line 3"),
-        (lambda rows: [*rows[:3], b"7.5,2\n"], "damaged near line 4 (a row without a time, or not with a cell"),
+        (lambda rows: [*rows[:3], b"7.5,2\n"], "damaged near line 4 (a row has no time, or not one cell"),
         (lambda rows: [*rows[:3], b"," + rows[3].split(b",", 1)[1]], "damaged near line 4"),
         (lambda rows: [*rows[:3], b'"' + rows[3]], "damaged near line 4"),
     ],
@@ -128,7 +128,9 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
     assert isinstance(rows, list)
     path.write_bytes(b"".join(rows))
     refused(
-        run, f"{path}: {why}", "move it away and resume again: it is written anew from the last 20 MB of the journal"
+        run,
+        f"{path}: {why}",
+        "move the file away and resume the run, which writes it again from the last 20 MB of the journal",
     )
     path.rename(run.folder / "M0_damaged.csv")
     Record(run.folder, ("M0",), fsync=False).close()
@@ -138,8 +140,8 @@ def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Ch
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (b"", "it has no backend"),
-        (b"[1]\n", "it holds no keys and values"),
+        (b"", "key backend is missing"),
+        (b"[1]\n", "the file has no keys and values"),
         (b"a: [", "in line 1"),
         (b"a: *x\n", "an alias or interpolation in line 1"),
         (b"\xff\xfe\0\1", "no UTF-8 text"),
@@ -156,7 +158,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
         frame._stored(path, "RUN", DeployConfig())
     assert f"{path}: not the config of this run (" in str(caught.value)
     assert why in str(caught.value)
-    assert str(caught.value).endswith("put it back as the run wrote it, or start a new run")
+    assert str(caught.value).endswith("restore the file as the run wrote it, or start a new run")
     assert "\n" not in str(caught.value)
 
 

@@ -119,7 +119,7 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(tmp_path, monkey
         ("env_file=x.yaml", "train"): "env_file=x.yaml",
     }
     assert {(arg, command): latest.resolved(arg, command) for arg, command in told} == told
-    with pytest.raises(ValueError, match=r"resume=latest: nothing of the kind .*python -m experiments\.benchmark"):
+    with pytest.raises(ValueError, match=r"resume=latest: no such output .*python -m experiments\.benchmark"):
         latest.resolved("resume=latest", "benchmark")
 
 
@@ -173,13 +173,13 @@ def test_what_a_run_leaves_is_named_with_the_command_that_goes_on(tmp_path: Path
     for name in ("config.yaml", "deploy.log", "events.out.1", "x.csv.part", ".hydra", "reactors"):
         (folder / name).mkdir(parents=True)
     command = frame.EntryPoint("deploy", None, lambda config, folder: None, resumes="state.json")
-    assert command._left(folder) == f"{folder} keeps no result; to try again, start anew"
+    assert command._left(folder) == f"{folder} keeps no result; to try again, start a new run"
     (folder / "journal.jsonl").touch()
     (folder / "recordings").mkdir()
-    assert command._left(folder) == f"{folder} keeps journal.jsonl, recordings/; to try again, start anew"
+    assert command._left(folder) == f"{folder} keeps journal.jsonl, recordings/; to try again, start a new run"
     (folder / "state.json").touch()
     kept = f"{folder} keeps journal.jsonl, recordings/, state.json"
-    assert command._left(folder) == f"{kept}; go on with: python -m experiments.deploy resume='{folder}'"
+    assert command._left(folder) == f"{kept}; continue with: python -m experiments.deploy resume='{folder}'"
 
 
 @pytest.mark.parametrize(
@@ -192,4 +192,4 @@ def test_what_a_run_leaves_is_named_with_the_command_that_goes_on(tmp_path: Path
 )  # fmt: skip
 def test_a_stop_before_anything_began_says_whether_a_pump_may_run(words, pumps, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", words)
-    assert start.stopped() == "stopped before anything began" + "; pumps not verified off: resume the run" * pumps
+    assert start.stopped() == "stopped before the command started" + "; pumps not verified off: resume the run" * pumps

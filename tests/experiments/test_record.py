@@ -234,8 +234,8 @@ def test_what_goes_wrong_without_a_new_sample_is_told_and_a_refusal_lasts_until_
     assert told == [
         ("alarm", "jump: 0.5 to 3", "M0"),
         ("alarm", "lost: no sample for 3 min", "M1"),
-        ("alarm", "interlock: all well again", "M0"),
-        ("alarm", "interlock: all well again", "M1"),
+        ("alarm", "interlock: all alarms ended", "M0"),
+        ("alarm", "interlock: all alarms ended", "M1"),
     ]
 
 

@@ -33,7 +33,7 @@ def started(cwd: Path, path: str, *program: str) -> subprocess.CompletedProcess[
 
 
 def clash(name: str, place: Path) -> str:
-    remedy = "rename that one, or start the command from another folder"
+    remedy = "rename the first one, or start the command from another folder"
     return f"package {name} is taken from {place}, not from {ROOT / name}; {remedy}"
 
 
@@ -94,7 +94,7 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, name: str, more: lis
         time.sleep(0.001)
     process.send_signal(signal.SIGINT)
     said = process.communicate()[1]
-    assert said == f"stopped before anything began{also}\n"
+    assert said == f"stopped before the command started{also}\n"
     assert process.returncode in (130, -signal.SIGINT)
     assert not list(tmp_path.iterdir())
 

@@ -79,7 +79,7 @@ class Run(Program):
 
 def go_on(run: Run, line: str) -> None:
     """Run the command that the line names, as it stands there."""
-    told = re.search(r"go on with: python (-m [\w.]+ resume=.+)$", line)
+    told = re.search(r"continue with: python (-m [\w.]+ resume=.+)$", line)
     assert told, line
     done = programs.run(*shlex.split(told[1])[1:], cwd=run.folder, **BLANK)
     assert done.returncode == 0, done.stderr
@@ -122,7 +122,7 @@ def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.benchmark", *words)
     run.until_there("run/training/dqn/progress.csv", lines=2)
     run.ctrl_c(signal.SIGTERM)  # its workers get it too
-    assert run.stopped() == "stopped; run keeps training/; to try again, start anew"
+    assert run.stopped() == "stopped; run keeps training/; to try again, start a new run"
     assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
 
 
@@ -265,7 +265,7 @@ def test_a_stopped_command_says_what_it_keeps(words: str, there: str, kept: str,
     run = Run(tmp_path, *words.split(), "hydra.run.dir=run")
     run.until_there(f"run/{there}")
     run.ctrl_c()
-    assert run.stopped() == f"stopped; run keeps {kept}; to try again, start anew"
+    assert run.stopped() == f"stopped; run keeps {kept}; to try again, start a new run"
 
 
 @pytest.mark.slow

@@ -78,7 +78,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     assert process.wait() == 130
     (line,) = (tmp_path / "err").read_text().splitlines()
     told = re.fullmatch(
-        r"stopped; 1 of 3 jobs finished in a sweep; what is missing: python -m experiments.train (.+)", line
+        r"stopped; 1 of 3 jobs finished in a sweep; run the missing jobs: python -m experiments.train (.+)", line
     )
     assert told, line
     before = (folder / "0/summary.json").stat().st_mtime_ns
@@ -144,7 +144,7 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
     job = sweep.Job.at(tmp_path)
     job.begin(TrainConfig())
     sweep.Job.at(tmp_path).begin(TrainConfig())
-    with pytest.raises(UserError, match=r"holds a run of another config; give another hydra\.sweep\.dir="):
+    with pytest.raises(UserError, match=r"has a run with another config; give another hydra\.sweep\.dir="):
         sweep.Job.at(tmp_path).begin(TrainConfig(seed=1))
     (tmp_path / "progress.csv").touch()
     job.put_aside()
@@ -220,7 +220,7 @@ def test_jobs_are_told_of_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     swept, done = sweep.Sweep(tmp_path, "train", []), f"10 of 12 jobs finished in {tmp_path}"
     assert sweep.progress(swept, None).startswith(f"{done}; compare them: ")  # a search: who failed has been tried
     every = [[f"++seed={k}"] for k in range(12)]
-    assert sweep.progress(swept, every) == f"{done}; what is missing: {swept.again()}"
+    assert sweep.progress(swept, every) == f"{done}; run the missing jobs: {swept.again()}"
 
 
 def saved(folder: Path, number: int, state: str, error: str = "") -> None:
@@ -269,7 +269,7 @@ def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_
         "finished", "running", "stopped", "finished",
     ]  # fmt: skip
     again = f"python -m experiments.train -m resume='{folder}'"
-    assert sweep.progress(swept, every) == f"{line}; 1 still running in other processes; what is missing: {again}"
+    assert sweep.progress(swept, every) == f"{line}; 1 still running in other processes; run the missing jobs: {again}"
     assert sweep.progress(swept, [*every, ["seed=4"]]).startswith("2 of 5 jobs finished")
 
 
@@ -288,7 +288,7 @@ def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothi
     assert sweep.asked(["+hparams_search=null", "seed=1"], "train") is None
     (tmp_path / "a" / "sweep.json").write_text("{")
     assert sweep.read(tmp_path / "a") is None
-    with pytest.raises(UserError, match="no sweep; continue a single run without -m"):
+    with pytest.raises(UserError, match="not a sweep; to continue a single run, drop -m"):
         sweep.asked(["-m", f"resume={tmp_path}"], "train")
 
 

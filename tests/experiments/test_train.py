@@ -152,7 +152,7 @@ def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, ta
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["env=coculture_preview", "agent=tuned"], r"rows of 2 numbers, this task observes 6"),
+        (["env=coculture_preview", "agent=tuned"], r"rows of 2 numbers, but this task observes 6"),
         (
             ["agent.total_steps=300", "agent.learn_start=300"],
             r"agent.learn_start = 300: allowed 0 to 299, below agent.total_steps",
