@@ -198,7 +198,7 @@ def _real(outcomes: Sequence[Outcome]) -> dict[str, Callable[[list[Outcome]], st
         return {}
     return {
         "times": lambda mine: str(sum(o.times for o in mine)),
-        "told after, s": lambda mine: _span([o.detected_s for o in mine], ".1f"),
+        "reported after, s": lambda mine: _span([o.detected_s for o in mine], ".1f"),
         "doses": lambda mine: str(sum(o.doses for o in mine)),
         "fed on record, mL": lambda mine: _sums((sum(o.low_ml for o in mine), sum(o.high_ml for o in mine))),
         "true, mL": lambda mine: _span([sum(o.fed_ml for o in mine)], ".2f"),
@@ -214,7 +214,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
     """Markdown: one row per fault over all moments; single cases are in cases.csv."""
     real = _real(outcomes)
     head = (
-        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "back after, min", "rows missed",
+        "fault", "reported after, min", "by", "response", "peak mL", "peak OD error", "back after, min", "rows missed",
         "rows lost", "doses doubled", "pumps off", *real, "as declared",
     )  # fmt: skip
     rows = []

@@ -163,7 +163,7 @@ def test_faults_of_both_families_are_cases_of_one_command() -> None:
 def test_the_table_of_the_rig_says_what_was_fed() -> None:
     head, _, row = table([judged(found_in(sound(), FAULT, "between", [STRUCK]), FAULT)]).splitlines()
     cells = dict(zip(head.split(" | "), row.split(" | "), strict=True))
-    assert (cells["told after, s"], cells["doses"], cells["times"]) == ("6.0", "10", "1")
+    assert (cells["reported after, s"], cells["doses"], cells["times"]) == ("6.0", "10", "1")
     assert (cells["fed on record, mL"], cells["true, mL"]) == ("5.00 to 5.00", "5.00")
 
 

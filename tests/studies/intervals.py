@@ -33,7 +33,7 @@ WORDS = dict(
 )
 SIMULATORS = ("own", "second")
 LONG_H = 72.0  # from which on fewer recordings are drawn
-COLUMNS = ("law", "h", "wander", "accepted", "hold, %", "bias, %", "half width, %", "wrong, %")
+COLUMNS = ("controller", "h", "wander", "accepted", "hold, %", "bias, %", "half width, %", "wrong, %")
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ WITHOUT = {
     "hindsight": ["agent.hindsight_share=0"],
     "falling rate": ["agent.learning_rate_end=null"],
 }
-OURS, LAW = "this program's DQN", "one look ahead, one line"
+OURS, LAW = "this program's DQN", "one-step lookahead, one line"
 PLANS = {
     "preview": {"10 min": 10, "20 min": 20, "30 min": 30},
     "coculture_preview": {"1 h": 60, "3 h": 180, "6 h": 360},
@@ -188,7 +188,7 @@ def laws(task: str) -> list[list[str]]:
     known, report = evaluation(task)
     acts: dict[str, Act] = {LAW: known.myopic}
     acts |= {"`half_way`, one line": half_way_law(known)} if isinstance(known, Preview) else {}
-    acts |= {f"a plan of {name}, made anew": planned(known, m) for name, m in PLANS.get(task, {}).items()}
+    acts |= {f"a plan of {name}, recomputed": planned(known, m) for name, m in PLANS.get(task, {}).items()}
     scores = [(name, report(act, 1)) for name, act in acts.items()]
     rows = [(name, float(s.regret_pct[0]), number(float(s.steady_abs_error[0]))) for name, s in scores]
     if isinstance(known, Coculture):

@@ -18,7 +18,7 @@ from tests.vendor.bench import BENCHES, ROOT, missing
 from tests.vendor.faults import FAULTS, PLANTED, Fault, play
 
 RESULT = ROOT / "docs" / "results" / "vendor_app.json"
-COLUMNS = ("fault", "told after, s", "by", "booked of true volume, mL, app", "emulator", "app", "emulator")
+COLUMNS = ("fault", "reported after, s", "by", "booked of true volume, mL, app", "emulator", "app", "emulator")
 
 
 def listed(words: str) -> list[str]:
