@@ -16,7 +16,7 @@ TIMED = re.compile(r"\d\d:\d\d:\d\d ")
 ALARM = re.compile(r"^\d\d:\d\d:\d\d (WARNING|ERROR|CRITICAL) |^failed|^error", re.IGNORECASE)
 ROUTINE = re.compile(  # said of every run
     r"(INFO|WARNING) (pass|note)  |policy|never weighed|interlock alarms|kept for the next dose|supervisor's law acts"
-    r"|setpoint .* from minute|writes to|recordings|next, all of it|ISE|of schedule|alarms ended|verified off"
+    r"|setpoint .* from minute|writes to|recordings|next, write all|ISE|schedule of|alarms ended|verified off"
     r"|stopped by the operator"
 )
 FALSE_KINDS = ("falls", "no_dilution", "cannot_hold")
