@@ -1,3 +1,3 @@
-"""Growth rate and pump constant from a recording: screening, choice of a window, fit with intervals. Reads no file.
+"""Growth rate and pump constant from a recording: screening, choice of a window, fit with intervals.
 
-Calibrate and benchmark import it."""
+The commands calibrate and benchmark use this package. It reads no files."""

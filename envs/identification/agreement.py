@@ -1,13 +1,13 @@
-"""Comparison of a run with its model: growth, pump and the next reading, and until when the model was right.
+"""Comparison of a run with its model: growth rate, pump gain and predictions, and since when the model was wrong.
 
-The model is the pair (mu, tau) that a run was planned with. Three things are compared with it, segment by segment: the
-growth rate and the pump's gain, each estimated from the segment alone, and the mean error of its predictions one row
-ahead,
+The model is the pair (mu, tau) with which a run was planned. Each segment of the run is compared with the model in
+three ways: by the growth rate, by the pump gain (both estimated from this segment alone), and by the mean error of
+predictions one row ahead,
 
-    e_i = ln y_{i+1} - ln y_i - (mu - u_i/tau) dt_i,
+    e_i = ln y_{i+1} - ln y_i - (mu - u_i/tau) dt_i.
 
-which shows an error of mu - u/tau even if a regulated culture does not identify mu and tau separately. Its interval is
-so narrow that one segment is enough. The other two need two segments in a row, since one in twenty is wrong by chance.
+This error shows a wrong mu - u/tau even if a regulated culture does not identify mu and tau separately. Its interval is
+narrow, so one wrong segment counts. Growth or gain must be wrong in two segments in a row: one in twenty is by chance.
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ from envs.identification.screening import OD_FLOOR, Screened, Series, screen
 
 Array = NDArray[np.float64]
 
-LAGS = 10  # rows over which errors are correlated: noise of a reading is in two of them
+LAGS = 10  # rows over which the errors e may be correlated; the noise of a reading enters two of them
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A parameter along a run and the model's value; None for a segment that does not identify it.
+    """Estimates of one parameter in the segments of a run, and the model's value.
 
-    first_min, end_min, found: of each segment, in order. expected: the model's value. scale: reference of the 10 %.
-    segments: number in a row that must exclude the model's value. line: through all, if they are enough.
-    """
+    first_min, end_min: start and end of each segment. found: its estimate, None if not identifiable. expected: the
+    model's value. scale: value that counts as 100 %. segments: number of segments in a row that must contradict the
+    model. line: straight line through the estimates, None if there are too few."""
 
     name: str
     first_min: tuple[float, ...]
@@ -45,9 +45,9 @@ class Compared:
 
     @property
     def left_min(self) -> float | None:
-        """Minute from which the model's value is wrong until the end of the run; None if it is right.
+        """Minute from which the model's value is wrong up to the end of the run; None if it is right at the end.
 
-        It is wrong in a segment whose interval excludes it and whose estimate differs by 10 % or more.
+        The value is wrong in a segment if the interval excludes it and the estimate differs by 10 % or more.
         """
         known = [(t, p) for t, p in zip(self.first_min, self.found, strict=True) if p is not None]
         outside = list(takewhile(lambda tp: self._wrong(tp[1]), reversed(known)))
@@ -57,22 +57,22 @@ class Compared:
         return not found.low <= self.expected <= found.high and abs(self.off_pct(found)) >= NOTABLE_DRIFT_PCT
 
     def off_pct(self, found: Parameter) -> float:
-        """Return the difference of an estimate from the model's value in per cent of the scale."""
+        """Return the estimate minus the model's value, in per cent of the scale."""
         return 100.0 * (found.value - self.expected) / self.scale
 
     @property
     def latest(self) -> Parameter | None:
-        """Last estimate."""
+        """Estimate of the last segment that has one."""
         return next((p for p in reversed(self.found) if p is not None), None)
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """A run against its model.
+    """Result of the comparison of a run with its model.
 
-    growth: mu, 1/min. gain: the pump's flow over the model's, tau_model/tau. net: mean of e per minute, 1/min.
-    predicted: OD one row ahead of the readings, nan where there is none, (n,); rms, attainable: of its error in OD,
-    with and without the mean of each segment. minutes: from the first to the last trustworthy reading.
+    growth: mu, 1/min. gain: pump flow relative to the model, tau_model/tau. net: mean of e per minute, 1/min.
+    predicted: OD predicted from the row before, nan without prediction, (n,). rms: its rms error, OD; attainable: the
+    same after subtraction of each segment's mean error. minutes: from the first to the last trustworthy reading.
     """
 
     series: Series
@@ -86,34 +86,34 @@ class Agreement:
 
     @property
     def left(self) -> list[Compared]:
-        """Parameters that are wrong at the end of the run, the earliest first."""
+        """Parameters that are wrong at the end of the run, sorted by the minute since which they are wrong."""
         found = [c for c in (self.growth, self.gain, self.net) if c.left_min is not None]
         return sorted(found, key=lambda c: c.left_min or 0.0)
 
     def verdict(self, planned: bool = True) -> str:
-        """Return one sentence: whether to calibrate again, and why.
+        """Return a sentence: whether to calibrate again, and why.
 
-        Args: planned: whether the run used a calibrated model; otherwise there is none to renew.
+        Args: planned: whether the run used a calibrated model. Only then is a new calibration recommended.
         """
         if self.minutes < SHORTEST_WINDOW_MIN:
             return (
-                f"Too short to tell: {self.minutes:.0f} min of trustworthy readings, at least "
+                f"Too short for a comparison: {self.minutes:.0f} min of trustworthy readings, at least "
                 f"{SHORTEST_WINDOW_MIN:.0f} are needed."
             )
         if self.left:
-            head = "Recalibrate: " if planned else f"{UNUSED}, and its culture is not the model: "
+            head = "Recalibrate: " if planned else f"{UNUSED}, but its culture differs from the model: "
             return f"{head}{'; '.join(_words(c) for c in self.left)}{self._which()}."
         unknown = " and ".join(c.name for c in (self.growth, self.gain) if c.latest is None)
-        but = f"; {unknown} cannot be told from these readings alone" if unknown else ""
+        but = f"; these readings alone do not determine {unknown}" if unknown else ""
         head = "No need to recalibrate: " if planned else f"{UNUSED}: "
-        return f"{head}the model held to the end of the run{but}."
+        return f"{head}the model was right to the end of the run{but}."
 
     def _which(self) -> str:
         """Return the two possible causes if only mu - u/tau is known to be wrong."""
         if self.left != [self.net] or self.net.latest is None:
             return ""
         faster, weaker = ("faster", "weaker") if self.net.latest.value > 0.0 else ("slower", "stronger")
-        return f"; the culture grows {faster} or the pump is {weaker}, which this run alone cannot tell"
+        return f"; either the culture grows {faster} or the pump is {weaker}, and this run alone does not show which"
 
 
 UNUSED = "This run needs no calibration"
@@ -127,7 +127,7 @@ def _words(c: Compared) -> str:
 
 
 def agreement(raw: Series, mu: float, tau: float) -> Agreement:
-    """Compare a run with the model (mu in 1/min, tau) that it was planned with.
+    """Compare a run with the model (mu in 1/min, tau) with which it was planned.
 
     Raises: ValueError when no trustworthy readings are left.
     """
@@ -159,7 +159,7 @@ def agreement(raw: Series, mu: float, tau: float) -> Agreement:
 
 
 def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tuple[Array, Array]:
-    """Return the predicted change of ln y from each row to the next, and e; nan without two readings in one stretch."""
+    """Return the predicted change of ln y from row to row, and e, which is nan unless one stretch has both readings."""
     step = np.diff(clean.time)
     predicted = (mu - clean.pump_rate[:-1] / tau) * step
     log_od = np.log(np.where(clean.od > OD_FLOOR, clean.od, np.nan))
@@ -171,7 +171,7 @@ def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tupl
 
 
 def _mean(error: Array, time: Array) -> Parameter | None:
-    """Return the mean of e per minute and its 95 % interval (Newey, West 1987, Econometrica 55:703) or None."""
+    """Return the mean of e per minute with its 95 % interval (Newey, West 1987, Econometrica 55:703) or None."""
     seen = np.isfinite(error)
     n = int(seen.sum())
     if n < MIN_READINGS:

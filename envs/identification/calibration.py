@@ -1,8 +1,8 @@
-"""From a raw recording to one trustworthy pair (mu, tau): screening, window, fit, validation and drift.
+"""Calibration of a raw recording, which gives one pair (mu, tau): screening, window, fit, validation and drift.
 
-A real culture changes over hours, the model's two numbers do not. So the fit uses the longest window without drift. The
-rows outside test the pair, and short segments over the whole recording show the drift. Two methods: `prediction_error`
-is valid for every pump control; `free_run` is the paper's.
+A real culture changes over hours, but mu and tau of the model are constant. So the fit uses the longest window without
+drift. The rows outside the window test the pair, and separate fits of short segments show the drift. There are two
+methods: `prediction_error` is valid for every pump control; `free_run` is that of the paper.
 """
 
 from dataclasses import dataclass, replace
@@ -21,22 +21,22 @@ from envs.identification.verdict import Calibration, Verdict, check_estimate, ju
 
 Array = NDArray[np.float64]
 
-FLOOR_FACTOR = 3.0  # limit of a prediction error relative to noise and disturbances
+FLOOR_FACTOR = 3.0  # acceptable PMSE of a prediction over that of noise and disturbances
 
 
 @dataclass(frozen=True)
 class IdentifyConfig:
-    """Settings of estimation, window and report."""
+    """Settings of estimation, window and drift report."""
 
     method: str = setting(
         "prediction_error",
-        "free_run: the paper's least squares, for open loop; prediction_error: also for feedback",
+        "prediction_error: for every recording; free_run: the paper's least squares, only for open loop",
         choices=("prediction_error", "free_run"),
     )
-    window: str = setting("auto", "auto: the longest stretch without drift; all: all rows", choices=("auto", "all"))
+    window: str = setting("auto", "auto: the longest part without drift; all: all rows", choices=("auto", "all"))
     pmse_limit: float = setting(
         0.5,
-        "largest PMSE of predictions without a warning (the paper's model: 6 %), at least 3 times the sensor's",
+        "PMSE of predictions above which to warn (the paper's model: 6 %); at least 3 times that of noise",
         "%",
         above=0.0,
         at_most=100.0,
@@ -44,9 +44,9 @@ class IdentifyConfig:
     )
     segment_min: float = setting(120.0, "length of the segments of the drift report", "min", within=(20, 1440))
     horizon_min: float = setting(
-        60.0, "prediction horizon of the validation on unseen readings", "min", within=(20, 1440)
+        60.0, "prediction horizon in the validation on unseen readings", "min", within=(20, 1440)
     )
-    seed: int = setting(0, "random seed of the noise models that the estimate is averaged over", at_least=0)
+    seed: int = setting(0, "random seed of the noise models over which the estimate is averaged", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "identify")
@@ -55,15 +55,15 @@ class IdentifyConfig:
 def calibrate(
     series: Series, config: IdentifyConfig = IdentifyConfig(), doubts: tuple[tuple[str, str], ...] = ()
 ) -> Calibration:
-    """Fit (mu, tau) to the best window of a recording and report the reliability of that pair.
+    """Fit (mu, tau) to the best window of a recording and judge the reliability of this pair.
 
-    Args: series: raw recording, `merged` if it has more rows than a week has minutes. doubts: about it, each with a
-    remedy, for the verdict.
-    Raises: NotIdentifiable if the trustworthy rows do not identify tau; ValueError without such rows.
+    Args: series: raw recording; apply `merged` if it has more rows than a week has minutes. doubts: problems of the
+    recording, each with its remedy, for the verdict.
+    Raises: NotIdentifiable if the trustworthy rows do not identify tau; ValueError without trustworthy rows.
     """
     screened = _without_outliers(screen(series), config)
     along = segments(screened, config.segment_min)
-    window, reason = longest(screened), "all trustworthy rows, as asked (identify.window=all)"
+    window, reason = longest(screened), "all trustworthy rows, as set by identify.window=all"
     if config.window == "auto":
         window, reason = choose_window(screened, along, config.segment_min)
     inside = screened.series.part(*window)
@@ -88,7 +88,7 @@ def calibrate(
     assert returned.tau is not None
     mu, tau = returned.mu, returned.tau
     shape, seen = trajectory(inside.time, inside.pump_rate, mu.value, tau.value, 1.0), np.isfinite(inside.od)
-    model = shape * (inside.od[seen] @ shape[seen]) / (shape[seen] @ shape[seen])  # from the start x_0 that fits best
+    model = shape * (inside.od[seen] @ shape[seen]) / (shape[seen] @ shape[seen])  # with the best-fitting start x_0
     result = Calibration(
         screened=screened,
         window=window,
@@ -114,21 +114,21 @@ def calibrate(
 
 
 def _check_between(name: str, whole: Parameter | None, alone: list[Parameter | None]) -> None:
-    """Refuse an estimate that lies 10 % or more beyond the intervals of all segments. Raises: NotIdentifiable."""
+    """Refuse an estimate that lies 10 % or more outside the intervals of all segments. Raises: NotIdentifiable."""
     known = [p for p in alone if p is not None]
     if whole is None or not known:
         return
     low, high, margin = min(p.low for p in known), max(p.high for p in known), NOTABLE_DRIFT_PCT / 100 * whole.value
     if not low - margin <= whole.value <= high + margin:
         raise NotIdentifiable(
-            f"{name} = {whole.value:.4g} of the whole window, but its {len(known)} segments alone give {low:.4g} to "
-            f"{high:.4g}: the culture or the pump changed on the way",
-            "give calibrate the rows before the change",
+            f"{name} is {whole.value:.4g} for the whole window, but {low:.4g} to {high:.4g} for its {len(known)} "
+            "segments, so the culture or the pump changed within the window",
+            "calibrate with the rows before the change",
         )
 
 
 def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
-    """Remove the readings that their segment's model contradicts."""
+    """Remove the readings that contradict the model of their segment."""
     clean, places = screened.series, pieces(screened, config.segment_min)
     bad = np.zeros(len(clean.od), dtype=np.bool_)
     found = outliers([clean.part(a, b) for a, b in places], config.seed) if places else []
@@ -136,12 +136,12 @@ def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
         bad[a:b] = marked
     if not bad.any():
         return screened
-    rejection = Rejection("outlier: contradicts all other readings of its segment", clean.row[bad])
+    rejection = Rejection("outlier: contradicts the other readings of its segment", clean.row[bad])
     return replace(screened, series=clean.rejecting(bad), rejections=(*screened.rejections, rejection))
 
 
 def _limit(result: Calibration, config: IdentifyConfig) -> float:
-    """Return the largest acceptable PMSE of a prediction, %: three times that of noise and estimated disturbances."""
+    """Return the largest acceptable PMSE, %: 3 times that of noise and disturbances, at least `pmse_limit`."""
     clean = result.screened.series
     noise = 100.0 * noise_sd(clean) ** 2 / float(np.nanmean(clean.od**2))
     if config.method == "prediction_error":
@@ -150,7 +150,7 @@ def _limit(result: Calibration, config: IdentifyConfig) -> float:
 
 
 def _free_run(inside: Series, method: str) -> Fit | None:
-    """Run the paper's fit; None if it fails and was not requested. Raises: NotIdentifiable."""
+    """Run the paper's fit. If it fails, return None for another `method`, else raise NotIdentifiable."""
     try:
         return fit(inside)
     except NotIdentifiable:

@@ -1,4 +1,4 @@
-"""Growth and pigment of one strain against temperature, from what recordings show at temperatures that were held."""
+"""Growth and pigment of one strain as functions of temperature, from recordings at constant temperatures."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from envs.identification.screening import Series, screen
 
 Array = NDArray[np.float64]
 
-HELD_C = 0.5  # a temperature within this of its running mean is constant
-WIDEST, LEAST_WIDTH = 0.2, 0.03  # limit of a growth rate's half width, relative or in 1/h
-WORTH_A_WORD_MIN = 30.0  # a longer stretch that is ignored is reported
+HELD_C = 0.5  # degC; a temperature within this of its mean so far counts as constant
+WIDEST, LEAST_WIDTH = 0.2, 0.03  # largest half width of a growth rate: relative, or in 1/h if that is larger
+WORTH_A_WORD_MIN = 30.0  # ignored stretches of this length or more are reported
 SATURATED = 65535.0  # counts
-LIGHT_MIN = 60.0  # at the end of a plateau, over which light is averaged
-BLOCKS = 4  # blocks of a plateau, whose scatter gives the interval of the mean
-EDGE_ROWS = 5  # whose median is the OD at the edge of a block
+LIGHT_MIN = 60.0  # min at the end of a plateau over which light is averaged
+BLOCKS = 4  # blocks of a plateau; their scatter gives the interval of the mean
+EDGE_ROWS = 5  # rows whose median is the OD at the edge of a block
 
 
 @dataclass(frozen=True)
 class Plateau:
-    """A stretch at one temperature: degC, growth rate in 1/h and light per OD in counts (None: no light there).
+    """Stretch of a recording at one temperature.
 
-    first, end: positions of its rows in the recording.
+    temperature: degC. growth: 1/h. light: counts per OD, None without light readings. first, end: rows [first, end).
     """
 
     temperature: float
@@ -35,9 +35,9 @@ class Plateau:
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A polynomial, coefficients highest power first, of T - centre.
+    """Fitted polynomial in T - centre.
 
-    off: distance of each point from it, in sds.
+    coefficients: highest power first. off: value minus polynomial for each fitted point, in standard deviations.
     """
 
     coefficients: tuple[float, ...]
@@ -53,14 +53,14 @@ def plateaus(
     least_min: float,
     offset: float = 0.0,
 ) -> tuple[list[Plateau], list[str]]:
-    """Return every stretch of constant temperature in a recording, after the time in which growth settles.
+    """Return the plateaus of a recording, stretches of constant temperature, and the reasons for ignored ones.
 
-    Growth is the increase of ln OD plus dilution, mu = (ln y_end - ln y_start + sum u dt / tau) / minutes, the mean
-    of four blocks, with an interval from their scatter. So the curves depend on the pump's flow; their crossing does
-    not. Light per OD is the mean over the last hour, less the offset. A stretch shorter than `least_min`, or with a
-    growth rate uncertain by more than 20 % and .03 1/h, is ignored. The second list has the reason for each ignored
-    stretch of half an hour or more.
-    Args: temperature: degC; light: counts; nan where there is none, (n,). tau: V/60 of the calibrated flow.
+    The first `settle_min` of each stretch are skipped, because growth still settles. Growth is the increase of ln OD
+    plus dilution, mu = (ln y_end - ln y_start + sum u dt / tau) / minutes; its interval comes from the scatter of four
+    blocks. So the growth curves depend on the pump's flow, but their crossing does not. Light per OD is the mean over
+    the last hour minus `offset`. A stretch is ignored if less than `least_min` remain or if its growth rate is
+    uncertain by more than 20 % and 0.03 1/h. The second list has the reasons, for stretches of half an hour or more.
+    Args: temperature: degC; light: counts; both (n,), nan without reading. tau: V/60 of the calibrated flow.
     """
     found: list[Plateau] = []
     left: list[str] = []
@@ -70,12 +70,12 @@ def plateaus(
         here = f"{np.nanmean(temperature[first:end]):.1f} degC from minute {series.time[first]:.0f} on"
         if held < settle_min + least_min:
             if held >= WORTH_A_WORD_MIN:
-                left.append(f"{here}: held for {held:.0f} min, it takes {settle_min + least_min:.0f}")
+                left.append(f"{here}: constant for {held:.0f} min, at least {settle_min + least_min:.0f} are needed")
             continue
         growth = _growth(screen(series.part(start, end)).series, tau)
         if growth is None or growth.half_width > max(WIDEST * growth.value, LEAST_WIDTH):
-            why = "no growth" if growth is None else f"growth of {growth.value:.3f} +- {growth.half_width:.3f} 1/h"
-            left.append(f"{here}: {why} says nothing of a curve")
+            why = "no growth" if growth is None else f"growth {growth.value:.3f} +- {growth.half_width:.3f} 1/h"
+            left.append(f"{here}: {why}, too uncertain for a curve")
             continue
         late = slice(max(int(np.searchsorted(series.time, series.time[end - 1] - LIGHT_MIN)), start), end)
         seen = np.where(light[late] < SATURATED, light[late], np.nan)
@@ -90,7 +90,7 @@ def plateaus(
 
 
 def _growth(part: Series, tau: float) -> Parameter | None:
-    """Return the growth rate of a stretch, 1/h; None with too few readings or without growth."""
+    """Return the growth rate of a stretch, 1/h, or None with too few readings or without growth."""
     seen = np.flatnonzero(part.od > 0.0)
     if seen.size < BLOCKS * 2 * EDGE_ROWS:
         return None
@@ -109,7 +109,7 @@ def _growth(part: Series, tau: float) -> Parameter | None:
 
 
 def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
-    """Return [first, end) of every stretch in which the temperature stays within `HELD_C` of its mean so far."""
+    """Return [first, end) of each stretch in which the temperature stays within `HELD_C` of its mean so far."""
     found, first, total, count = [], 0, 0.0, 0
     for k, t in enumerate(temperature):
         if np.isnan(t):
@@ -122,7 +122,7 @@ def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
 
 
 def fit(temperature: Array, value: Array, sd: Array, degree: int, centre: float = 0.0) -> Polynomial:
-    """Fit the weighted least-squares polynomial to points (K,), of a degree less than their number."""
+    """Fit a polynomial of `degree` < K to K points by weighted least squares; sd: of each value. Arrays (K,)."""
     powers = np.vander(temperature - centre, degree + 1)
     weighted = powers / sd[:, None]
     coefficients, *_ = np.linalg.lstsq(weighted, value / sd, rcond=None)

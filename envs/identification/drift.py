@@ -1,6 +1,6 @@
 """Drift of mu and tau along a recording: separate fits of short segments, a line through their estimates, the window.
 
-The window is the stretch of a recording for one pair (mu, tau).
+The window is the part of a recording to which one pair (mu, tau) is fitted.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ Window = tuple[int, int]
 NOTABLE_DRIFT_PCT = 10.0
 WANDERING_PCT = 33.0
 SHORTEST_WINDOW_MIN = 60.0
-SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
+SUSPICION = 0.65  # fraction of a 95 % half width that gives the 80 % interval
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A short separate fit: positions [first, end), its middle in min, and its estimates; None: not identifiable."""
+    """Short part of a recording, rows [first, end), with its middle, min, and its estimates; None: not identifiable."""
 
     first: int
     end: int
@@ -39,8 +39,8 @@ class Segment:
 class Drift:
     """Weighted straight line through the segments' estimates of one parameter.
 
-    first, last: the line at the first and the last segment. change_pct: between them.
-    slope_per_h with its 95 % interval; significant when that excludes zero.
+    first, last: value of the line at the first and last segment. change_pct: change from first to last.
+    slope_per_h: slope with its 95 % interval. segments: number of estimates.
     """
 
     first: float
@@ -51,17 +51,17 @@ class Drift:
 
     @property
     def significant(self) -> bool:
-        """True when the slope's interval excludes zero."""
+        """Whether the interval of the slope excludes zero."""
         return self.slope_per_h.low > 0.0 or self.slope_per_h.high < 0.0
 
     @property
     def notable(self) -> bool:
-        """Whether it is significant and 10 % or more between the ends."""
+        """Whether the drift is significant and changes the parameter by 10 % or more."""
         return self.significant and abs(self.change_pct) >= NOTABLE_DRIFT_PCT
 
 
 def pairs(parts: list[Series]) -> list[Pair]:
-    """Estimate (mu, tau) of each series, None if not identifiable; a series without dilution gives mu only."""
+    """Estimate (mu, tau) of each series, None where not identifiable; without dilution only mu is."""
     found: list[Pair] = []
     for e in estimate(parts, QUICK) if parts else []:
         known = e.condition < WORST_CONDITION and _narrow(e.mu)
@@ -85,13 +85,13 @@ def cuts(clean: Series, a: int, b: int, length: float) -> list[tuple[int, int]]:
 
 
 def pieces(screened: Screened, length: float) -> list[tuple[int, int]]:
-    """Cut the stretches into pieces of about `length` min, without those of too few readings for an estimate."""
+    """Cut the stretches into pieces of about `length` min; drop those with too few readings for an estimate."""
     places = (place for stretch in screened.stretches for place in cuts(screened.series, *stretch, length))
     return [place for place in places if enough(screened.series.part(*place))]
 
 
 def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
-    """Fit segments of about `length` min separately; a segment whose pump never ran gives mu only."""
+    """Fit segments of about `length` min separately; if its pump never ran, a segment has an estimate of mu only."""
     places = pieces(screened, length)
     parts = [screened.series.part(*place) for place in places]
     return tuple(
@@ -101,10 +101,10 @@ def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
 
 
 def drifts(along: tuple[Segment, ...]) -> bool:
-    """Tell whether tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
+    """Return whether segments drift: tau by 10 % or mu by a third, outside the 80 % interval, or mu in such a step.
 
-    Fluctuating growth is part of the model and mu its mean. The rule is stricter than that of a warning, because a
-    window must not drift.
+    mu may change more because growth fluctuates in the model, and mu is its mean. The rule is stricter than that of a
+    warning, because a window must not drift.
     """
     mu, tau = drift(along, [s.mu for s in along]), drift(along, [s.tau for s in along])
     return _steps([s.mu for s in along if s.mu is not None]) or any(
@@ -116,10 +116,10 @@ def drifts(along: tuple[Segment, ...]) -> bool:
 
 
 def _steps(found: list[Parameter]) -> bool:
-    """Return whether the estimates before some place differ by a third from those after it, beyond their scatter.
+    """Return whether the mean estimate changes by more than a third, and more than by chance, at any segment.
 
-    An estimate that is uncertain by more than a third is ignored: at constant OD such estimates are all biased to one
-    side.
+    Estimates that are uncertain by more than a third are ignored, because at constant OD all such estimates are biased
+    to the same side.
     """
     found = [p for p in found if p.half_width < WANDERING_PCT / 100.0 * p.value]
     value = np.array([p.value for p in found])
@@ -136,7 +136,7 @@ def _steps(found: list[Parameter]) -> bool:
 
 
 def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift | None:
-    """Fit a line through at least four estimates, weighted by their intervals; scatter widens the slope's."""
+    """Fit a line to four or more estimates (else None), weighted by their intervals; scatter widens the slope's."""
     from scipy.special import stdtrit
 
     known = [(s.middle_min, v) for s, v in zip(along, values, strict=True) if v is not None]
@@ -159,18 +159,18 @@ def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift |
 def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: float) -> tuple[Window, str]:
     """Return positions [first, end) of the window with most readings, and the reason as text.
 
-    A window is consecutive segments of one stretch without drift, of at most a week. Windows with a segment that
-    identifies tau, and without a segment in which dilution had no effect (`_failed`), are preferred. Raises:
-    NotIdentifiable without a window of at least an hour.
+    A window consists of consecutive segments of one stretch, without drift, for at most a week. Windows are preferred
+    if a segment identifies tau and dilution had an effect in every segment (`_failed`).
+    Raises: NotIdentifiable without a window of at least an hour.
     """
     clean = screened.series
     failed = _failed(clean, along)
     apart = float(np.median(np.diff(clean.time)))
     if segment_min < FEWEST_READINGS * apart:
         raise NotIdentifiable(
-            f"rows are {apart:.3g} min apart, and a segment of {segment_min:g} min holds {segment_min / apart:.0f}; "
+            f"rows are {apart:.3g} min apart, so a segment of {segment_min:g} min has {segment_min / apart:.0f} rows; "
             f"allowed at least {FEWEST_READINGS}",
-            f"check the unit of time, or say identify.segment_min={2 * FEWEST_READINGS * apart:.0f}",
+            f"check the unit of time, or set identify.segment_min={2 * FEWEST_READINGS * apart:.0f}",
         )
     count = np.concatenate([[0], np.cumsum(np.isfinite(clean.od))])
     best: Window | None = None
@@ -193,16 +193,16 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
             "record for longer",
         )
     if best in screened.stretches:
-        return best, "all trustworthy rows" if len(screened.stretches) == 1 else "the longest stretch without a pause"
+        return best, "all trustworthy rows" if len(screened.stretches) == 1 else "the longest part without a pause"
     follows = [s for s in along if s.first == best[1]]
     capped = any(_minutes(clean, best[0], s.end) > WEEK_MIN for s in follows)
-    return best, "the longest stretch without drift" + (", of a week at most" if capped else "")
+    return best, "the longest part without drift" + (", limited to a week" if capped else "")
 
 
 def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
-    """Find segments of at least median pump rate that identify no tau although most of them do.
+    """Find segments that do not identify tau although their pump rate is at least the median and most such ones do.
 
-    Causes are a failed feed or a collapsed culture: the recorded pump rate does not dilute.
+    In these segments the recorded pumping did not dilute: the feed failed or the culture collapsed.
     """
     pumped = [float(clean.pump_rate[s.first : s.end].mean()) for s in along]
     busy = [s for s, rate in zip(along, pumped, strict=True) if rate >= np.median(pumped) and rate > 0.0]
@@ -211,7 +211,7 @@ def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
 
 
 def longest(screened: Screened) -> Window:
-    """Choose the stretch with most readings."""
+    """Return the stretch with the most readings."""
     return max(screened.stretches, key=lambda s: np.isfinite(screened.series.od[s[0] : s[1]]).sum())
 
 

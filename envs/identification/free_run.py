@@ -1,8 +1,8 @@
-"""The paper's fit: least squares of a free trajectory from a fitted start.
+"""The paper's fit: least squares between readings and a simulated trajectory whose start is fitted, too.
 
-For open-loop recordings. Its intervals allow for correlated errors of the readings; if the pump responds to the
-readings, or doses and growth vary, estimates are too small and intervals too narrow (docs/calibration.md, Method). Pure
-functions of arrays; no file, no clock, no random numbers.
+The fit is for open-loop recordings. Its intervals allow for correlated errors of the readings. If the pump responds to
+the readings, or doses and growth vary, estimates are too small and intervals too narrow (docs/calibration.md, Method).
+All functions are pure functions of arrays.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ HUBER_SD = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted pair and the quality of its fit.
+    """Fitted pair and the quality of its fit.
 
     mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s; None if only mu was fitted.
     start_od: fitted OD at the first row.
-    model: simulated OD, shape (n,). pmse_pct, rms: see `pmse`; root mean square of the residuals, OD.
-    n_used: readings fitted. autocorrelation: of the residuals at lag 1.
+    model: simulated OD, shape (n,). pmse_pct: see `pmse`. rms: root mean square of the residuals, OD.
+    n_used: number of fitted readings. autocorrelation: that of the residuals at lag 1.
     """
 
     mu: Parameter
@@ -39,20 +39,20 @@ class Fit:
 
 
 def _basis(series: Series, used: NDArray[np.intp], with_tau: bool) -> Array:
-    """Differentiate ln x at the rows `used` with respect to (mu, [1/tau], ln x_0), shape (m, p); ln x is linear."""
+    """Return the derivatives of ln x at the rows `used` by (mu, [1/tau], ln x_0), (m, p); ln x is linear in these."""
     elapsed, volume = series.time[used] - series.time[0], pumped_volume(series.time, series.pump_rate)[used]
     return np.column_stack([elapsed, *([-volume] if with_tau else []), np.ones(len(used))])
 
 
 def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Solve by Levenberg-Marquardt with the exact derivatives and Huber's loss by reweighting.
+    """Fit by Levenberg-Marquardt with exact derivatives; Huber's loss is applied by reweighting.
 
-    A reading has full weight up to 3 robust sd: the larger of the sd of the residuals, and of the relative residuals
-    times the model. So noisier readings at a high OD are not outliers.
+    A reading has full weight up to 3 robust sd. This sd is the larger of the residuals' sd and the relative residuals'
+    sd times the model, so the noisier readings at a high OD are not outliers.
 
-    Returns: parameters (p,), derivatives of the model (m, p), residuals model - y clipped by the loss and where, (m,).
+    Returns: parameters (p,), derivatives of the model (m, p), residuals model - y limited by the loss, whether limited.
     """
-    from scipy.optimize import least_squares  # takes half a second, which a refused command should not
+    from scipy.optimize import least_squares  # takes half a second, which a refused command must not cost
 
     size = np.maximum(y, OD_FLOOR)
     best = np.linalg.lstsq(basis * size[:, None], np.log(size) * size, rcond=None)[0]  # sd of ln y is sd(y) / y
@@ -87,17 +87,17 @@ def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, N
 def fit(series: Series, robust: bool = True) -> Fit:
     """Fit the simulated OD to the readings: minimise sum rho(x_i - y_i) over mu, 1/tau and ln x_0.
 
-    rho is the square, beyond 3 robust sd linear (Huber). Intervals come from the sandwich covariance
-    H^-1 S H^-1 with S the long-run covariance of the scores (see `_sum_variance`), so that correlated and uneven
-    errors widen them, each residual divided by 1 - leverage (the jackknife's correction, MacKinnon & White 1985, J.
-    Econom. 29:305), and Student's t with the degrees of freedom of the effective number of readings. The interval of
-    tau is the inverted interval of 1/tau.
+    rho is the square, and linear beyond 3 robust sd (Huber). Intervals come from the sandwich covariance H^-1 S H^-1.
+    S is the long-run covariance of the scores (see `_sum_variance`), so correlated and uneven errors widen the
+    intervals. Each residual is divided by 1 - leverage (jackknife correction, MacKinnon & White 1985, J. Econom.
+    29:305). Quantiles are those of Student's t; its degrees of freedom follow from the effective number of readings.
+    The interval of tau is the inverted interval of 1/tau.
 
     Args:
-      series: readings may be nan; time and pump rate count throughout.
+      series: readings may be nan; times and pump rates of all rows are used.
       robust: False: plain least squares.
-    Returns: see `Fit`; tau is None when the pump never runs.
-    Raises: NotIdentifiable when the readings are too few or the interval of 1/tau reaches zero.
+    Returns: see `Fit`; tau is None if the pump never runs.
+    Raises: NotIdentifiable if the readings are too few or the interval of 1/tau reaches zero.
     """
     with_tau = bool((series.pump_rate[:-1] > 0.0).any())
     used = np.flatnonzero(np.isfinite(series.od))
@@ -107,8 +107,8 @@ def fit(series: Series, robust: bool = True) -> Fit:
     normal = jacobian[~clipped].T @ jacobian[~clipped]
     if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > WORST_CONDITION:
         raise NotIdentifiable(
-            f"rows {series.row[0]}-{series.row[-1]}: growth and dilution cannot be told apart (the pump's rate never "
-            "changes); use a recording in which the pump rests and runs"
+            f"rows {series.row[0]}-{series.row[-1]}: growth and dilution cannot be distinguished, because the pump's "
+            "rate never changes; use a recording in which the pump runs and stops"
         )
     inverse = np.linalg.inv(normal)
     leverage = np.minimum(np.einsum("ij,jk,ik->i", jacobian, inverse, jacobian), 0.5)
@@ -136,20 +136,20 @@ def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Paramet
     if low <= 0.0 or (high - low) / 2 > WIDEST * value:
         raise NotIdentifiable(
             f"rows {series.row[0]}-{series.row[-1]}: 1/tau = {value:.3g} with the 95 % interval {low:.3g} to "
-            f"{high:.3g}; allowed within +-{100 * WIDEST:.0f} %: they do not determine tau: too little "
-            "dilution, too much noise, or a culture that drifts; choose other rows"
+            f"{high:.3g}; allowed +-{100 * WIDEST:.0f} %, so these rows do not determine tau: too little dilution, too "
+            "much noise, or a drifting culture; choose other rows"
         )
     return Parameter(1.0 / value, 1.0 / high, 1.0 / low)
 
 
 def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float, float, float]:
-    """Return the value and 95 % interval from the influence of each reading, shape (m,), in order of time.
+    """Return the value and its 95 % interval from the influence z of each reading, shape (m,), in order of time.
 
-    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`, but at least sum z^2, because negative correlation is an
-    accident of a short record. A few readings at a high OD have most of the information, and correlated readings repeat
-    each other, so V is uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after Satterthwaite's
-    effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their correlation is
-    estimated from the same readings. docs/records/calibration.md measures the coverage.
+    The half width is t_{0.975, nu} sqrt(V). V is `_sum_variance`, but at least sum z^2, because a negative correlation
+    is an accident of a short record. V is uncertain: a few readings at a high OD have most of the information, and
+    correlated readings repeat each other. So nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4. For normal
+    errors, Satterthwaite's effective number of readings is 3 (sum z^2)^2 / sum z^4; half of it is used because the
+    correlation is estimated from the same readings. docs/records/calibration.md measures the coverage.
     """
     from scipy.special import stdtrit
 

@@ -1,6 +1,6 @@
-"""The model of a recording and common parts of its fits: trajectory, PMSE, estimates, identifiability of tau.
+"""Model of a recording and common parts of its fits: trajectory, PMSE, estimates, identifiability of tau.
 
-With u held from each row to the next, equation (5) of the paper has the exact solution
+If u is constant from each row to the next, equation (5) of the paper has the exact solution
 
     x_i = x_0 exp(mu (t_i - t_0) - C_i / tau),    C_i = sum_{j<i} u_j (t_{j+1} - t_j),
 
@@ -18,19 +18,19 @@ Array = NDArray[np.float64]
 
 MIN_READINGS = 20
 CONFIDENCE = 0.95
-WORST_CONDITION = 1e8  # of scaled normal equations
-WIDEST = 0.5  # largest half width of an interval over its value
-MIN_STEPS = 3  # rows at a low and at a high pump rate, needed for tau
+WORST_CONDITION = 1e8  # largest condition number of the scaled normal equations
+WIDEST = 0.5  # largest half width of an interval, relative to the value
+MIN_STEPS = 3  # rows that are needed at a low and at a high pump rate to determine tau
 
 
 REMEDY = (
-    "record with the pump stopped for 10 min every hour (which tells both within about 5 %), or in open loop as "
-    "generate=true does"
+    "record with the pump stopped for 10 min every hour (this determines mu and tau to about 5 %), or in open loop "
+    "like generate=true"
 )
 
 
 class NotIdentifiable(ValueError):
-    """Error of rows that do not identify the parameters: reason, and a better recording."""
+    """Error for rows that do not identify the parameters. why: the reason; remedy: how to record better."""
 
     def __init__(self, why: str, remedy: str = REMEDY) -> None:
         super().__init__(f"{why}; {remedy}")
@@ -39,7 +39,7 @@ class NotIdentifiable(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """An estimate with its 95 % interval."""
+    """Estimate of a parameter with its 95 % interval, low to high."""
 
     value: float
     low: float
@@ -47,17 +47,17 @@ class Parameter:
 
     @property
     def half_width(self) -> float:
-        """Half the interval's width, in the parameter's unit."""
+        """Half the width of the interval, in the unit of the parameter."""
         return 0.5 * (self.high - self.low)
 
 
 def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | float, start_od: Array | float) -> Array:
-    """Compute x of equation (5) at the rows' times, started at the first row; exact for u held between rows.
+    """Compute x of equation (5) at the times of the rows, from the first row on; exact if u is constant between rows.
 
     Args:
       time: min, shape (n,) or (N, n). pump_rate: mL/s, same shape.
       mu: 1/min. tau: > 0. start_od: OD. Scalars or shape (N,).
-    Returns: shape (n,) for scalars and one recording, else (N, n). Raises: nothing.
+    Returns: OD, shape (n,) for scalars and one recording, else (N, n).
     """
     mu, tau, start_od = (np.asarray(p, dtype=np.float64)[..., None] for p in (mu, tau, start_od))
     elapsed = time - time[..., :1]
@@ -65,9 +65,9 @@ def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | fl
 
 
 def pmse(od: Array, model: Array) -> float:
-    """Percentage mean square error, 100 * sum (x - x_model)^2 / sum x^2, over the rows with a reading; in %.
+    """Return the percentage mean square error, 100 * sum (x - x_model)^2 / sum x^2, over the rows with a reading, %.
 
-    Args: od: measured, nan where there is none, shape (n,). model: same shape.
+    Args: od: measured x, nan without a reading, shape (n,). model: x_model, same shape.
     """
     used = np.isfinite(od)
     return float(100.0 * np.sum((od[used] - model[used]) ** 2) / np.sum(od[used] ** 2))
@@ -76,8 +76,8 @@ def pmse(od: Array, model: Array) -> float:
 def check_excitation(series: Series) -> None:
     """Refuse rows in which dilution and growth cannot be distinguished.
 
-    Only a changing pump rate identifies tau: without feed 1/tau multiplies zero, and with a constant rate only mu -
-    u/tau is identified. The two lowest and the two highest rates may be odd rows and are ignored.
+    Only a changing pump rate identifies tau: without feed 1/tau has no effect, and a constant rate identifies only
+    mu - u/tau. The two lowest and the two highest rates are ignored, because single rows can be wrong.
 
     Raises: NotIdentifiable.
     """
@@ -91,10 +91,10 @@ def check_excitation(series: Series) -> None:
     low, high = float(rate[MIN_STEPS - 1]), float(rate[-MIN_STEPS])
     if high == 0.0:
         ran = f"runs in {int((rate > 0.0).sum())} rows, at least {MIN_STEPS} are needed" if rate[-1] else "never runs"
-        why = f"{where}: the pump {ran}, so nothing tells tau"
-        raise NotIdentifiable(why, "record with a pump that runs and rests")
+        why = f"{where}: the pump {ran}, so tau cannot be determined"
+        raise NotIdentifiable(why, "record while the pump runs and stops")
     if high - low < 1e-3 * high:
         raise NotIdentifiable(
-            f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s) in {MIN_STEPS} rows or "
-            "more, so growth and dilution cannot be told apart"
+            f"{where}: the pump runs at {high:g} mL/s in nearly all rows (another rate is needed in at least "
+            f"{MIN_STEPS} rows), so growth and dilution cannot be distinguished"
         )

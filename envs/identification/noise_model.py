@@ -1,22 +1,22 @@
-"""The noise model of a recording, averaged by adaptive multiple importance sampling over its unknown parameters.
+"""Noise model of a recording, averaged over its unknown parameters by adaptive multiple importance sampling.
 
-A point of the noise model is drawn from seven independent standard normals z, so that the prior of each number is a
-function of its z and no number has an edge:
+A point of the noise model is computed from seven independent standard normals z. So each parameter below is a function
+of its z, which also defines its prior. F is the normal distribution function:
 
-    p      clip(1.5 F(z) - 0.25)      share of a reading's variance that is in proportion to the OD, not alike at every
-                                      OD; F is the normal distribution function
-    dose   0.3 exp(1.7 z)             sd of a mean dose's effect, in sd of a reading
-    wander 0.1 exp(1.5 z)             sd of growth that wanders, in sd of a reading per minute
-    memory 5 + 35 exp(z) min          after which it has forgotten 63 %
+    p      clip(1.5 F(z) - 0.25)      fraction of the noise variance that grows with OD^2; the rest is constant
+    dose   0.3 exp(1.7 z)             sd of the effect of a mean dose, in sd of a reading
+    wander 0.1 exp(1.5 z)             sd of the growth fluctuations, in sd of a reading per minute
+    memory 5 + 35 exp(z) min          correlation time of the growth fluctuations
     phi    0.9 F(z)                   correlation of reading noise from row to row
-    late   clip(1.5 F(z) - 0.25)^2    share of a dose that the next reading does not see yet: one in six each at 0 and 1
-    mixing late clip(1.5 F(z) - 0.25) share of what a reading did not see that the one after does not see either: late
-                                      itself where a stirred vial mixes in first order; 0.7 at most, as a dose that
-                                      is never seen would tell nothing of tau
+    late   clip(1.5 F(z) - 0.25)^2    fraction of a dose missing from the next reading; 1/6 probability of 0, and of 1
+    mixing late clip(1.5 F(z) - 0.25) fraction of this missing part that is still missing one reading later; equals
+                                      late if the vial mixes in first order; limited to 0.7, because a dose that never
+                                      appears contains no information on tau
 
-`average` weighs points by their likelihood: first some of the prior, then rounds of them from a Student t with five
-degrees of freedom, fitted to all points before it. Weights for that fit are tempered where few points carry them all.
-Every point is weighed against the mixture of all proposals (Cornuet et al. 2012, Scand. J. Stat. 39:798).
+`average` draws points in rounds and weights them by their likelihood. The first round is drawn from the prior, each
+later one from a Student t with five degrees of freedom, fitted to all points so far. If few points have nearly all
+weight, the weights are tempered for this fit. The weight of a point is relative to the mixture of all rounds (Cornuet
+et al. 2012, Scand. J. Stat. 39:798).
 """
 
 from collections.abc import Callable
@@ -28,15 +28,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FULL = 10 * (128,)  # points of each round
-QUICK = (128, 64, 64)  # for many short series whose single intervals decide nothing
-TAIL = 5  # degrees of freedom of a proposal
-FEWEST_EFFECTIVE = 24  # least effective points for the fit of a proposal
-LEAST_SPREAD = 0.01  # sd of a proposal in each direction, of the prior's
+QUICK = (128, 64, 64)  # for many short series, where no single interval is decisive
+TAIL = 5  # degrees of freedom of a proposal, the distribution of a round
+FEWEST_EFFECTIVE = 24  # smallest number of effective points for the fit of a proposal
+LEAST_SPREAD = 0.01  # smallest sd of a proposal in each direction; the prior's is 1
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Points of the noise model, each number of shape (M, G); see the module's docstring."""
+    """G points of the noise model for each of M series; parameters as in the module's docstring, each (M, G)."""
 
     p: Array
     dose: Array
@@ -53,7 +53,7 @@ class NoiseModel:
 
         p, dose, wander, memory, phi, late, again = np.moveaxis(z, -1, 0)
         p, late, again = (np.clip(1.5 * ndtr(share) - 0.25, 0.0, 1.0) for share in (p, late, again))
-        late = late**2  # draws enough small values between the atom and the rest
+        late = late**2  # gives more of the small values above 0
         return cls(
             p=p,
             dose=0.3 * np.exp(1.7 * dose),
@@ -66,10 +66,10 @@ class NoiseModel:
 
 
 def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...], seed: int) -> tuple[Array, Array]:
-    """Points of the noise model and their weights for each of M series.
+    """Draw points of the noise model and compute their weights, for each of M series.
 
-    Args: score: logarithm of the likelihood at z, (M, g, 7) -> (M, g). series: M. rounds: points of each; the first are
-      drawn from the prior. seed: of the draws, the same for every series, so that series are independent.
+    Args: score: logarithm of the likelihood at z, (M, g, 7) -> (M, g). series: M. rounds: number of points in each
+      round. seed: random seed, the same for every series, so that a result does not depend on the other series.
     Returns: z (M, G, 7) and weights (M, G) that sum to 1.
     """
     rng, d = np.random.default_rng(seed), len(fields(NoiseModel))
@@ -87,7 +87,7 @@ def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...
 
 @dataclass(frozen=True, eq=False)
 class _Student:
-    """A Student t distribution for each series: centre (M, 7), root of the spread (M, 7, 7), degrees of freedom."""
+    """Student t distribution per series: centre (M, 7), root of the spread (M, 7, 7), degrees (inf: normal)."""
 
     centre: Array
     root: Array
@@ -116,7 +116,7 @@ class _Student:
 
 
 def _fitted(z: Array, weight: Array) -> _Student:
-    """Fit the proposal: mean and covariance of weighted points."""
+    """Fit a proposal to the mean and covariance of weighted points."""
     centre = np.sum(weight[..., None] * z, axis=1)
     away = z - centre[:, None]
     spread = (weight[..., None] * away).swapaxes(-1, -2) @ away + LEAST_SPREAD**2 * np.eye(z.shape[-1])
@@ -134,7 +134,7 @@ def effective(weight: Array) -> Array:
 
 
 def _tempered(log_weight: Array) -> Array:
-    """Raise weights to the largest power up to 1 that leaves FEWEST_EFFECTIVE effective points."""
+    """Return weights raised to the largest power <= 1 that leaves FEWEST_EFFECTIVE effective points, normalised."""
     chosen = _normalised(log_weight)
     for power in np.geomspace(0.8, 1e-6, 60):
         thin = effective(chosen) < FEWEST_EFFECTIVE

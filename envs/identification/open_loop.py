@@ -1,4 +1,4 @@
-"""Simulated recordings: the paper's open-loop experiment (growth, dilution, random pump rates), or any law's."""
+"""Simulated recordings: the paper's open-loop experiment (growth, dilution, random pump rates) or any controller."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from envs.task import MAX_PUMP_RATE, EnvConfig
 
 Array = NDArray[np.float64]
 Decide = Callable[[float, Array], Array]
-"""(minute, readings of shape (N,)) -> pump rates in mL/s, shape (N,), held to the next row."""
+"""Controller: (minute, readings of shape (N,)) -> pump rates in mL/s, shape (N,), constant to the next row."""
 
-GROWTH_MIN, DILUTE_TO, HOLD_MIN = 60.0, 0.3, 30.0  # min without feed; OD down to which the pump runs; min of each rate
+GROWTH_MIN, DILUTE_TO, HOLD_MIN = 60.0, 0.3, 30.0  # min without feed; OD at which dilution ends; min per random rate
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class OpenLoop:
     """Protocol, culture and sensor of a simulated open-loop recording.
 
     The paper (section 4): 60 min of growth, dilution at the maximum until OD < 0.3, then a random pump rate every
-    30 min. Rates are drawn from the agent's 17. What the paper does not say: outside `keep_od` a new rate is drawn at
-    once, from the half of the rates that leads back, as an experimenter would, so that no draw washes the culture out.
+    30 min, one of the agent's 17. Not in the paper: outside `keep_od` a new rate is drawn at once, from the half of the
+    rates that leads back into this range. So no draw washes the culture out.
     """
 
     mu: float = setting(0.028, "specific growth rate", "1/min", above=0.0, at_most=0.1)
-    tau: float = setting(0.31, "u/tau is the dilution rate in 1/min; below 0.02/mu: the pump outruns growth", above=0.0)
+    tau: float = setting(0.31, "u/tau is the dilution rate in 1/min; must be below 0.02/mu", above=0.0)
     start_od: float = setting(0.12, "OD at the start", "OD", above=0.0, at_most=2.0)
     hours: float = setting(6.0, "length of the recording", "h", within=(1, 100))
     control_min: float = setting(1.0, "time between rows", "min", within=(0.1, 10))
@@ -38,28 +38,30 @@ class OpenLoop:
         interval=True,
     )
     noise: float = setting(0.01, "sd of a reading relative to the OD", within=(0, 0.2))
-    noise_correlation: float = setting(0.12, "from row to row; median of public Chi.Bio logs", within=(0, 0.95))
+    noise_correlation: float = setting(
+        0.12, "correlation of this noise from row to row; median of public Chi.Bio logs", within=(0, 0.95)
+    )
     outlier_share: float = setting(0.0, "fraction of readings that are off by 10 to 50 %", within=(0, 0.2))
     dose_cv: float = setting(0.0, "sd of a dose relative to its volume", within=(0, 0.5))
     growth_cv: float = setting(0.0, "sd of the fluctuating growth rate relative to mu", within=(0, 0.5))
     growth_memory_min: float = setting(30.0, "correlation time of the growth fluctuations", "min", within=(1, 1000))
-    late_share: float = setting(0.0, "fraction of a dose that is seen one row late", within=(0, 1))
+    late_share: float = setting(0.0, "fraction of a dose that readings show one row late", within=(0, 1))
     seed: int = setting(1, "random seed of pump rates, noise and disturbances", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "protocol")
-        outrun = "> 0 and below 0.02/mu, so that the pump can outrun growth"
+        outrun = "> 0 and below 0.02/mu, so that the pump can dilute faster than the culture grows"
         require(self.tau < self.fastest, "protocol.tau", self.tau, outrun)
         require(self.keep_od[0] < self.keep_od[1], "protocol.keep_od", self.keep_od, "0 < low < high")
 
     @property
     def fastest(self) -> float:
-        """The tau at which the pump at its maximum only balances growth."""
+        """Upper limit of tau, at which the pump at its maximum rate just balances growth."""
         return MAX_PUMP_RATE / self.mu if self.mu > 0.0 else np.inf
 
 
 def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[Array, Array, Array]:
-    """N recordings of the open-loop experiment with their own noise and their own random pump rates; see `recordings`.
+    """Simulate N recordings of the open-loop experiment; noise and random pump rates differ. See `recordings`.
 
     Returns: time in min, shape (T,); measured OD, shape (N, T); pump rate in mL/s held to the next row, shape (N, T).
     """
@@ -71,13 +73,13 @@ def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[A
 def recordings(
     config: OpenLoop, decide: Decide, rng: np.random.Generator, n: int = 1
 ) -> tuple[Array, Array, Array, Array]:
-    """N recordings of the same culture under a law of pumping that sees the noisy readings.
+    """Simulate N recordings of the same culture; the controller `decide` sees the noisy readings.
 
-    From row to row x <- x exp((m - (1 + e) u/tau) dt), m = mu (1 + w), which is exact for rates held between rows; e is
-    the spread of the doses, w wanders as a first-order process. A reading is x, with the last dose's late share not yet
-    in it, times 1 + noise.
+    From row to row x <- x exp((m - (1 + e) u/tau) dt) with m = mu (1 + w), exact for constant rates between rows. e is
+    the random error of a dose, w a first-order random process. A reading is x without the effect of the last dose's
+    late share, times 1 + noise.
 
-    Args: config: culture and sensor. decide: the law. rng: source of noise; disturbances have a stream of their own.
+    Args: config: culture and sensor. decide: see `Decide`. rng: source of the noise and, by a spawned stream, of e, w.
     Returns: time in min, shape (T,); measured OD, shape (N, T); pump rate in mL/s held to the next row, shape (N, T);
       mean growth rate over the rows, 1/min, shape (N,).
     """
@@ -104,7 +106,7 @@ def recordings(
 
 
 class OpenLoopLaw:
-    """Which rate each of N experiments applies next: grow, dilute, then random steps."""
+    """Controller of N open-loop experiments: growth, dilution, then random steps of the pump rate."""
 
     def __init__(self, config: OpenLoop, n: int, rng: np.random.Generator) -> None:
         self.config, self.rng = config, rng
@@ -114,7 +116,7 @@ class OpenLoopLaw:
         self.until = np.zeros(n)
 
     def decide(self, t: float, od: Array) -> Array:
-        """Pump rates from `t` min on, mL/s, shape (N,)."""
+        """Return the pump rates from minute `t` on, mL/s, shape (N,)."""
         c = self.config
         pick = self.rng.random(len(od))
         grown = t >= GROWTH_MIN

@@ -1,21 +1,21 @@
-"""Growth rate mu and dilution constant tau by the prediction-error method: also unbiased under feedback.
+"""Growth rate mu and dilution constant tau by the prediction-error method, which is unbiased even under feedback.
 
-A free run from one start treats every disturbance as sensor noise. Under feedback the pump answers those disturbances,
-pump and error are correlated, and least squares shrinks mu and 1/tau. Here the model contains the disturbances, and
-each reading is compared with its prediction from all earlier readings:
+A free run from one start treats every disturbance as sensor noise. Under feedback the pump responds to disturbances, so
+pump rate and error are correlated, and least squares estimates mu and 1/tau too small. Here the model contains the
+disturbances, and each reading is compared with its prediction from all earlier readings:
 
     ln y_i = b + mu t_i - k (C_i - q l_i) + s_i + sigma r_i v_i       k = 1/tau, c_i = u_i dt_i, C_i = sum_{j<i} c_j
-    l_i = c_{i-1} + h l_{i-1}                                         doses that mix late, late share q, h of it again
-    s_{i+1} = s_i + w_i dt_i + sigma d (c_i / c_rms) xi_i             doses that spread
-    w_{i+1} = a w_i + sqrt(1 - a^2) sigma om eta_i,  a = exp(-dt/T)   growth that wanders
+    l_i = c_{i-1} + h l_{i-1}                                         late mixing: q of a dose is late, then q h, ...
+    s_{i+1} = s_i + w_i dt_i + sigma d (c_i / c_rms) xi_i             random errors of the doses
+    w_{i+1} = a w_i + sqrt(1 - a^2) sigma om eta_i,  a = exp(-dt/T)   fluctuations of growth
     v_{i+1} = phi v_i + sqrt(1 - phi^2) nu_i                          reading noise, correlated from row to row
 
-with xi, eta, nu independent standard normal, r^2 = p + (1 - p)(x_mean/x)^2 (p = 1: noise in proportion to the OD, 0:
-as large at every OD; x is a running median, never the reading itself). A rate decided from reading i acts from row i
-on. For given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1, t
-and -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville
-1974, Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is no
-optimiser and no local minimum (docs/calibration.md, Method).
+with xi, eta, nu independent standard normal and r^2 = p + (1 - p)(x_mean/x)^2. For p = 1 the noise is proportional to
+the OD, for p = 0 it is constant; x is a running median of the readings. A rate decided from reading i acts from row i
+on. For given (p, d, om, T, phi, q, h) the fit is generalised least squares: one Kalman filter with shared gains runs
+over the columns ln y, 1, t and -(C - q l). Its likelihood is the restricted one, with sigma, b, mu and k integrated out
+(Harville 1974, Biometrika 61:383). All points of the noise model are filtered at once, and results are averaged over
+them (`noise_model`). So there is no optimiser and no local minimum (docs/calibration.md, Method).
 """
 
 from collections.abc import Iterator
@@ -33,19 +33,19 @@ Mask = NDArray[np.bool_]
 
 LEVEL_ROWS = 5  # width of the running median of the OD level
 COLUMNS = 4  # ln y, 1, t, -C
-MU, K = 1, 2  # positions among the three regressors
-STRATA = 64  # of each point's Student t
+MU, K = 1, 2  # positions of mu and k among the three regressors
+STRATA = 64  # strata of the Student t of each point
 
 OUTLIER_SD = 4.5
 
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """M series padded to n rows, input of the filter. Shapes (M, n), columns (M, n, 3).
+    """Input of the filter: M series, padded to n rows. Shape (M, n) unless given.
 
-    reading: whether there is one. dt: min to the next row, 0 in the padding. each: c. rms: c_rms, (M,). level:
-    x / x_mean. columns: ln y, 1 and t. volume: C. scale: (M, 3), by which each regressor is divided. span: min between
-    first and last row, (M,). mean_od: of the running median, (M,).
+    reading: whether the row has a reading. dt: min to the next row, 0 in the padding. each: c. rms: c_rms, (M,).
+    level: x / x_mean. columns: ln y, 1 and t, (M, n, 3). volume: C. scale: divisor of each regressor, (M, 3).
+    span: min between first and last row, (M,). mean_od: mean of the running median, (M,).
     """
 
     reading: Mask
@@ -61,7 +61,7 @@ class _Batch:
 
     @property
     def degrees(self) -> Array:
-        """Readings less regressors, shape (M,)."""
+        """Degrees of freedom: number of readings minus number of regressors, shape (M,)."""
         regressors = 2 + (self.volume.max(axis=1) > 0.0)
         return np.asarray(np.maximum(self.reading.sum(axis=1) - regressors, 1), dtype=np.float64)
 
@@ -103,7 +103,7 @@ def _batch(parts: list[Series]) -> _Batch:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One row of the filter: gain (4, M, G) before the transition, variance (M, G), innovation (4, M, G)."""
+    """One row of the filter: gain before the transition (4, M, G), variance (M, G), innovation per column (4, M, G)."""
 
     gain: Array
     variance: Array
@@ -111,31 +111,31 @@ class _Step:
 
 
 class _Filter:
-    """Kalman filter of (s, w, v, S), S' = S + w dt, over all columns with shared gains; sigma = 1.
+    """Kalman filter of the state (s, w, v, S), with S' = S + w dt, for all columns with shared gains; sigma = 1.
 
     Args: batch: M series. cells: G points of the noise model for each, arrays of shape (M, G).
-    After `rows` has ended, `covariance` (4, 4, M, G) and `state` (4, 4, M, G) are those after the last row.
+    After the iterator `rows` has ended, `covariance` and `state`, both (4, 4, M, G), are those after the last row.
     """
 
     def __init__(self, batch: _Batch, cells: NoiseModel) -> None:
         self.batch, self.cells = batch, cells
         self.shape = cells.p.shape
-        self._both = np.zeros((4, 4 + COLUMNS, *self.shape))  # the covariance, and minus the state beside it
+        self._both = np.zeros((4, 4 + COLUMNS, *self.shape))  # covariance, and minus the state
         self.covariance = self._both[:, :4]
         self.covariance[1, 1], self.covariance[2, 2] = cells.wander**2, 1.0
         self._level, self._alike = batch.level**-2.0, 1.0 - cells.p
         self._dose, self._each = (cells.dose / batch.rms[:, None]) ** 2, batch.each**2
         self._late, self._volume = cells.late / batch.scale[:, K, None], batch.volume / batch.scale[:, K, None]
-        self._changed = np.any(np.diff(batch.dt, axis=1, prepend=np.nan) != 0.0, axis=0)  # or the first row
+        self._changed = np.any(np.diff(batch.dt, axis=1, prepend=np.nan) != 0.0, axis=0)  # also True in row 0
         self._kept, self._fresh = np.ones((4, 4 + COLUMNS, *self.shape)), np.zeros((2, *self.shape))
 
     @property
     def state(self) -> Array:
-        """Of each column, shape (4, 4, M, G)."""
+        """State of each column, shape (4, 4, M, G)."""
         return np.asarray(-self._both[:, 4:])
 
     def rows(self) -> Iterator[_Step]:
-        """Iterate over the innovations of every row, 0 where there is no reading."""
+        """Yield gain, variance and innovation of every row; the innovation is 0 without a reading."""
         b, both, late = self.batch, self._both, np.zeros(self.shape)
         everyone = np.all(b.reading, axis=0)
         for i in range(b.dt.shape[1]):
@@ -173,7 +173,7 @@ class _Filter:
         covariance[2, 2] += self._fresh[1]
 
     def _meet(self, decay: Array) -> None:
-        """Prepare the decay of w and v in a row, and the variance of their noise."""
+        """Set the decay of w and v in a row, and the variances of their noise."""
         kept = np.stack([np.ones(self.shape), decay, self.cells.phi, np.ones(self.shape)])
         self._kept[:, :4] = kept[:, None] * kept
         self._kept[:, 4:] = kept[:, None]
@@ -182,11 +182,12 @@ class _Filter:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """Generalised least squares of M series at G points of the noise model.
+    """Generalised least squares of M series at G points of the noise model. Shape (M, G) unless given.
 
-    best: coefficients of the three regressors (M, G, 3). spread: their covariance for sigma = 1 (M, G, 3, 3). rss:
-    (M, G). score: logarithm of the restricted likelihood, up to a constant (M, G). drift: S after the last row of each
-    column (M, G, 4), and its variance for sigma = 1 (M, G). condition: of the normal equations, scaled (M, G).
+    best: coefficients of the three regressors, (M, G, 3). spread: their covariance for sigma = 1, (M, G, 3, 3).
+    rss: residual sum of squares. score: logarithm of the restricted likelihood, up to a constant. drift: S of each
+    column after the last row, (M, G, 4). drift_variance: variance of S for sigma = 1. condition: of the scaled normal
+    equations.
     """
 
     best: Array
@@ -232,14 +233,15 @@ def _solve(batch: _Batch, cells: NoiseModel) -> _Solved:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of the fit; a good fit has innovations of variance 1 and correlation 0.
+    """Quality of a fit. In a good fit the innovations have variance 1 and autocorrelation 0.
 
-    variance, autocorrelation: of the one-step innovations in units of their own predicted sd, at the mean noise model.
-    late_share: of a dose, not seen by the next reading. dose_spread: sd of a dose over its mean size. growth_spread: sd
-    of the mean growth over an hour, over mu. noise: sd of a reading relative to its OD at the mean OD; it is
-    hypot(noise_floor, noise_relative * OD) in OD, with the correlation noise_lag1 from row to row. feedback:
-    correlation of an innovation with the change of the pump rate made on it; answers: whether it exceeds chance,
-    2/sqrt(n). effective: effective points of the average. hills: 95 % of 1/tau's between points over that within.
+    variance, autocorrelation: of the innovations, in units of their predicted sd, at the mean noise model.
+    late_share: fraction of a dose missing from the next reading. dose_spread: sd of a dose relative to its mean.
+    growth_spread: sd of the hourly mean of the growth rate, relative to mu. noise: sd of a reading relative to the OD,
+    at the mean OD. noise_floor, noise_relative: the sd of a reading is hypot(noise_floor, noise_relative * OD).
+    noise_lag1: correlation of the noise from row to row. feedback: correlation of the innovations with the following
+    change of the pump rate. answers: whether `feedback` exceeds chance, 2/sqrt(n). effective: effective number of
+    points. hills: 95 % interval of 1/tau between points of the noise model, relative to that within a point.
     """
 
     variance: float
@@ -259,10 +261,10 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimate of mu (mean over the rows) and tau of one series with 95 % intervals; None if not identifiable.
+    """Estimate of mu (mean over the rows) and tau of one series with 95 % intervals; tau is None if not identifiable.
 
-    condition: of the normal equations, scaled. expected: OD predicted from earlier readings and the pump, nan without a
-    reading (n,). innovation: of each reading in units of its predicted sd, (n,).
+    condition: condition number of the scaled normal equations. expected: OD predicted from earlier readings and the
+    pump, nan without a reading, (n,). innovation: innovation of each reading in units of its predicted sd, (n,).
     """
 
     mu: Parameter
@@ -275,15 +277,14 @@ class Estimate:
 
 
 def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0) -> list[Estimate]:
-    """Fit each of M series separately, in one pass.
+    """Fit each of M series separately, in one pass; return an `Estimate` of each.
 
-    Intervals are quantiles of the mixture of the points' Student t distributions. mu is the mean of the growth rate
-    over the rows, mu + S_end/L with S the integral of w and L the rows' duration: which the rows identify even if
-    growth fluctuates as slowly as the recording is long.
+    Intervals are quantiles of the mixture of the points' Student t distributions. The reported mu is the mean growth
+    rate over the rows, mu + S_end/L, with S the integral of w and L the duration of the rows. The rows identify this
+    mean even if the growth rate fluctuates very slowly. Check an estimate with `verdict.check_estimate`.
 
-    Args: parts: screened series; readings may be nan, time and pump count throughout. rounds: points of the noise
-      model; QUICK for many short parts whose single intervals decide nothing. seed: of the points.
-    Returns: one `Estimate` each; check it by `verdict.check_estimate`.
+    Args: parts: screened series; readings may be nan, times and pump rates of all rows are used. rounds: numbers of
+      points of the noise model; QUICK for many short parts, where no single interval is decisive. seed: random seed.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)
@@ -295,7 +296,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
     k = solved.best[..., K] / batch.scale[:, None, K]
     k_sd = sigma * np.sqrt(np.maximum(solved.spread[..., K, K], 0.0)) / batch.scale[:, None, K]
     hours = cells.memory / 60.0
-    hourly = np.sqrt(2.0 * hours * (1.0 + hours * np.expm1(-1.0 / hours)))  # sd of w's mean over an hour, over its sd
+    hourly = np.sqrt(2.0 * hours * (1.0 + hours * np.expm1(-1.0 / hours)))  # sd of w's hourly mean over the sd of w
     growth, growth_sd = _mean_growth(batch, solved, sigma)
     found = []
     for m, part in enumerate(parts):
@@ -342,7 +343,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
 
 
 def _averaged(batch: _Batch, rounds: tuple[int, ...], seed: int) -> tuple[NoiseModel, _Solved, Array, NoiseModel]:
-    """Return points of the noise model, their solutions, weights (M, G), and the mean point of each series."""
+    """Return the points of the noise model, their solutions and weights (M, G), and the mean point of each series."""
     solved: list[_Solved] = []
 
     def score(z: Array) -> Array:
@@ -356,7 +357,7 @@ def _averaged(batch: _Batch, rounds: tuple[int, ...], seed: int) -> tuple[NoiseM
 
 
 def _mean_growth(batch: _Batch, solved: _Solved, sigma: Array) -> tuple[Array, Array]:
-    """Compute mu + S_end/L and its sd, (M, G): linear in the coefficients, as S of each column has the same gains."""
+    """Compute mu + S_end/L and its sd, (M, G); linear in the coefficients, because all columns share the gains."""
     span = batch.span[:, None]
     towards = -solved.drift[..., 1:] / span[..., None]
     towards[..., MU] += 1.0 / batch.scale[:, None, MU]
@@ -366,7 +367,7 @@ def _mean_growth(batch: _Batch, solved: _Solved, sigma: Array) -> tuple[Array, A
 
 
 def _quantiles(centre: Array, sd: Array, weight: Array, degrees: float) -> Parameter:
-    """Return median and central 95 % of a mixture of Student t distributions, in STRATA of equal probability each."""
+    """Return median and central 95 % of a mixture of Student t distributions, each in STRATA of equal probability."""
     from scipy.special import stdtrit
 
     places = stdtrit(degrees, (np.arange(STRATA) + 0.5) / STRATA)
@@ -384,7 +385,7 @@ def _weighted(values: Array, weight: Array) -> Parameter:
 
 
 def _feedback(part: Series, innovation: Array) -> float:
-    """Correlate the innovations with the following change of the pump rate; 0 if either is constant."""
+    """Return the correlation of the innovations with the change of the pump rate after them; 0 if one is constant."""
     seen = np.isfinite(innovation)
     z = innovation[seen] - innovation[seen].mean()
     change = np.diff(part.pump_rate, prepend=part.pump_rate[0])[seen]
@@ -394,11 +395,12 @@ def _feedback(part: Series, innovation: Array) -> float:
 
 
 def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
-    """Find readings that all others contradict: deletion residual beyond 4.5 robust sd, the largest of five neighbours.
+    """Find readings that the other readings contradict: deletion residual beyond 4.5 robust sd, largest of five rows.
 
-    With e = ln y - X b and V its covariance, reading i differs from its prediction by all others by (V^-1 e)_i /
-    sqrt((V^-1)_ii) sd; a disturbance smoother at the mean noise model gives both (de Jong 1989, Biometrika 76:82).
-    Three passes, since a large outlier hides a small one.
+    With e = ln y - X b and V its covariance, the deletion residual (V^-1 e)_i / sqrt((V^-1)_ii) is the difference of
+    reading i from its prediction by all other readings, in sd. A disturbance smoother at the mean noise model gives
+    both factors (de Jong 1989, Biometrika 76:82). There are up to three passes, because a large outlier hides a small
+    one.
 
     Returns: for each series True at its outliers, shape (n,).
     """
@@ -415,7 +417,7 @@ def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
 
 
 def _deletion_residuals(batch: _Batch, cells: NoiseModel, best: Array) -> Array:
-    """Return (V^-1 e)_i / sqrt((V^-1)_ii) for sigma = 1, nan without a reading, shape (M, n)."""
+    """Return the deletion residuals (V^-1 e)_i / sqrt((V^-1)_ii) for sigma = 1, nan without a reading, (M, n)."""
     run = _Filter(batch, cells)
     steps = list(run.rows())
     m, n = batch.dt.shape
@@ -439,7 +441,7 @@ def _deletion_residuals(batch: _Batch, cells: NoiseModel, best: Array) -> Array:
 
 
 def _back(run: _Filter, i: int, pull: Array, weight: Array) -> tuple[Array, Array]:
-    """Return T' r and T' N T of row i, with T the transition of `_Filter` after the row."""
+    """Return T' r and T' N T of row i for r = pull, N = weight; T is the transition of `_Filter` after the row."""
     m = pull.shape[1]
     transition = np.zeros((4, 4, m))
     dt, decay = run.batch.dt[:, i], run.decay(i)[:, 0]
@@ -454,6 +456,6 @@ def _peaks(residual: Array) -> Mask:
     size = np.where(np.isfinite(residual), np.abs(residual), 0.0)
     known = size[np.isfinite(residual)]
     limit = OUTLIER_SD * 1.4826 * float(np.median(known)) if len(known) else np.inf
-    # an outlier makes its two neighbours on each side look wrong as well
+    # an outlier also raises the residuals of its two neighbours on each side
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 2), 5).max(axis=1)
     return np.asarray((size > limit) & (size == around))

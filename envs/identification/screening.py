@@ -1,8 +1,8 @@
-"""Which readings of a recording can be trusted: outliers, frozen or broken sensors, gaps. NumPy only, no model fitted.
+"""Screening of a recording: reject readings of outliers and of frozen or broken sensors, and find gaps.
 
-The criterion is the detrended log OD r = ln y - mu t + C/tau, C the pumped volume (the integral of u), with a robust
-pilot estimate of mu and 1/tau from short differences: r moves slowly in every culture, so a jump in r comes from the
-sensor or a hand.
+The criterion is the detrended log OD r = ln y - mu t + C/tau, with C the pumped volume (the integral of u) and a robust
+preliminary estimate of mu and 1/tau from short differences. r changes slowly in every culture, so a jump of r comes
+from the sensor or from somebody who touched the vial.
 """
 
 from __future__ import annotations
@@ -18,30 +18,29 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-OD_FLOOR = 1e-3  # below it a logarithm is meaningless
+OD_FLOOR = 1e-3  # smallest OD whose logarithm is used
 OUTLIER_SD = 6.0
-OUTLIER_SHARE = 0.05  # a deviation below 5 % of the OD is left to the robust loss
+OUTLIER_SHARE = 0.05  # smallest deviation of an outlier over the OD; a robust loss handles smaller ones
 OUTLIER_WINDOW = 11  # rows; finds bursts of up to five bad readings (bubbles: docs/biology.md, Sensor)
 NOISE_WINDOW = 61
-JUMP_LOG = 0.35  # a factor of 1.4 between the medians of five readings before and after
-JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps hardly affect a fit
+JUMP_LOG = 0.35  # ln of the smallest factor (1.4) between the medians of five readings before and after a jump
+JUMP_SHARE = 0.1  # smallest jump over the recording's 95th OD percentile; smaller steps hardly affect a fit
 JUMP_ROWS = 5
-SHORT_ROWS = 10  # between two jumps; a shorter part is a burst, not a regime
+SHORT_ROWS = 10  # readings; a part between two jumps with fewer is a burst, not a regime
 FROZEN_ROWS = 10
 FEWEST_READINGS = 10  # least number of readings for an estimate
 NOISY_FACTOR = 6.0
 WEEK_MIN = 10080
-LATE_MIN = 0.3  # of a merged minute, before its last reading
-GAP_MIN = 5.0  # and five times the usual spacing: the pump's action in between is unknown
+LATE_MIN = 0.3  # min before the last reading of a merged minute from which readings are used
+GAP_MIN = 5.0  # a longer pause, also longer than five usual intervals, is a gap: the pump's action in it is unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A recording for the fit.
+    """Recording for the fit; all arrays have shape (n,).
 
-    time: min, strictly increasing, shape (n,). od: OD, nan where there is no reading, shape (n,).
-    pump_rate: mL/s, >= 0, held from each row to the next, shape (n,).
-    row: number by which rows are reported, increasing, shape (n,).
+    time: min, strictly increasing. od: OD, nan without a reading. pump_rate: mL/s, >= 0, constant from each row to the
+    next. row: row number for messages, increasing.
     Raises: ValueError for other shapes or values.
     """
 
@@ -53,25 +52,25 @@ class Series:
     def __post_init__(self) -> None:
         shapes = {self.time.shape, self.od.shape, self.pump_rate.shape, self.row.shape}
         if len(shapes) != 1 or self.time.ndim != 1:
-            raise ValueError(f"series: shapes {sorted(shapes)}: allowed is one shape (n,) for all four arrays")
+            raise ValueError(f"series: shapes {sorted(shapes)}: allowed one shape (n,) for all four arrays")
         if not (np.diff(self.time) > 0).all() or not np.isfinite(self.time).all():
             raise ValueError("series: times must be finite and strictly increasing, in min")
         if not (self.pump_rate >= 0.0).all():
             raise ValueError("series: pump rates must be >= 0 mL/s")
 
     def part(self, first: int, end: int) -> Series:
-        """Return positions [first, end) as a series."""
+        """Return the rows at positions [first, end) as a series."""
         s = slice(first, end)
         return Series(self.time[s], self.od[s], self.pump_rate[s], self.row[s])
 
     def rejecting(self, bad: Mask) -> Series:
-        """Return the series without the readings of `bad`, shape (n,), which become nan; time and pump stay."""
+        """Return the series with nan for the readings marked in `bad`, shape (n,); times and pump rates are kept."""
         return Series(self.time, np.where(bad, np.nan, self.od), self.pump_rate, self.row)
 
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """Readings rejected for one reason; rows are row numbers."""
+    """Readings rejected for one reason. rows: their row numbers."""
 
     reason: str
     rows: NDArray[np.int64]
@@ -79,9 +78,9 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A series without its faulty readings, its trustworthy stretches, and the rejections.
+    """Series without its faulty readings, and the rejections.
 
-    stretches: positions [first, end) between jumps and gaps that may be fitted, in order.
+    stretches: positions [first, end) of the trustworthy parts between gaps, in order of time.
     """
 
     series: Series
@@ -90,23 +89,23 @@ class Screened:
 
 
 def pumped_volume(time: Array, pump_rate: Array) -> Array:
-    """C_i = sum_{j<i} u_j (t_{j+1} - t_j), in mL/s min; C/tau is the accumulated dilution. Shape (..., n), C_0 = 0."""
+    """Return C_i = sum_{j<i} u_j (t_{j+1} - t_j), mL/s min, (..., n), C_0 = 0. C/tau is the accumulated dilution."""
     steps = pump_rate[..., :-1] * np.diff(time, axis=-1)
     start = np.zeros((*steps.shape[:-1], 1))
     return np.concatenate([start, np.cumsum(steps, axis=-1)], axis=-1)
 
 
 def runs(mask: Mask) -> list[tuple[int, int]]:
-    """Return positions [first, end) of the stretches in which a mask, shape (n,), is True."""
+    """Return positions [first, end) of the runs of True in a mask, shape (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def merged(series: Series, longest: int = WEEK_MIN) -> Series:
-    """Merge rows of half a minute and less, where there are more of them than `longest`: than a week has minutes.
+    """Merge the rows of each minute if rows are half a minute or less apart and more than `longest` in number.
 
-    A merged row has the time of its last reading and the median of the readings of the 18 s before it, so a dose keeps
-    its order with readings; the pumped volume is kept.
+    A merged row has the time of its last reading and the median of the readings in the 18 s up to this time. So the
+    order of doses and readings is kept. The pumped volume is kept, too. `longest` is the number of minutes in a week.
     """
     if len(series.time) <= longest:
         return series
@@ -138,7 +137,7 @@ def row_spans(rows: NDArray[np.int64]) -> str:
 
 
 def _slow_log_od(series: Series) -> Array:
-    """Compute r of the module's docstring, shape (n,), nan where there is no reading."""
+    """Compute r of the module's docstring, shape (n,), nan without a reading."""
     volume = pumped_volume(series.time, series.pump_rate)
     log_od = np.log(np.maximum(series.od, OD_FLOOR))
     lag = 5
@@ -161,7 +160,7 @@ def _slow_log_od(series: Series) -> Array:
 
 
 def running_median(values: Array, width: int) -> Array:
-    """Take the running median over `width` (odd) neighbours ignoring nan, shape (n,); nan only where all are."""
+    """Return the running median over `width` (odd) rows, ignoring nan, shape (n,); nan where all rows are nan."""
     half = width // 2
     padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
     windows = np.sort(sliding_window_view(padded, width), axis=1)  # nan last
@@ -172,14 +171,14 @@ def running_median(values: Array, width: int) -> Array:
 
 
 def _deviation(series: Series, slow: Array) -> tuple[Array, Array]:
-    """Return the deviation of each reading from its neighbourhood, and its expected OD; both OD, shape (n,)."""
+    """Return the deviation of each reading from the OD expected from its neighbours, and this OD, each (n,)."""
     trend = np.log(np.maximum(series.od, OD_FLOOR)) - slow
     expected = np.exp(running_median(slow, OUTLIER_WINDOW) + trend)
     return series.od - expected, expected
 
 
 def noise_sd(series: Series) -> float:
-    """Return the robust sd of a reading about its neighbourhood (11 rows), OD: the noise of the sensor."""
+    """Return the noise of the sensor, OD: robust sd of a reading about its neighbours (11 rows)."""
     deviation, _ = _deviation(series, _slow_log_od(series))
     return float(1.4826 * np.nanmedian(np.abs(deviation)))
 
@@ -187,8 +186,8 @@ def noise_sd(series: Series) -> float:
 def screen(series: Series) -> Screened:
     """Find frozen, outlying and noisy readings, gaps, and impossible jumps.
 
-    Jumps split the recording into regimes. The one with most readings is kept; the others are rejected, also the last
-    reading before an upward jump, since a reading averages over several seconds. A gap only splits the recording.
+    Jumps split the recording into regimes. The regime with the most readings is kept, the others are rejected. If a
+    later regime is rejected, the last reading before it is, too: it may average over the jump. A gap rejects nothing.
 
     Returns: see `Screened`. Raises: ValueError if fewer than ten readings are left.
     """
@@ -197,7 +196,7 @@ def screen(series: Series) -> Screened:
     label = np.full(len(series.od), -1)
 
     def reject(bad: Mask, reason: str) -> Series:
-        label[bad & readings] = len(reasons)  # the latest rejection is the widest and counts
+        label[bad & readings] = len(reasons)  # of several reasons the last one counts
         reasons.append(reason)
         return series.rejecting(label >= 0)
 
@@ -231,13 +230,13 @@ def _check_left(series: Series) -> None:
     left = int((series.od > 0.0).sum())
     if left < FEWEST_READINGS:
         raise ValueError(
-            f"{left} trustworthy readings above zero are left, at least {FEWEST_READINGS} are needed: the sensor was "
-            "frozen, dark or erratic throughout"
+            f"{left} trustworthy readings above zero, at least {FEWEST_READINGS} are needed: nearly all readings are "
+            "frozen, zero or erratic; check the sensor"
         )
 
 
 def _frozen(od: Array) -> Mask:
-    """Mark the repeats (not the first) in a stretch of equal readings of at least FROZEN_ROWS."""
+    """Mark all but the first reading in each run of FROZEN_ROWS or more equal readings."""
     frozen = np.zeros(len(od), dtype=np.bool_)
     for a, b in runs(np.concatenate([[False], od[1:] == od[:-1]])):
         if b - a + 1 >= FROZEN_ROWS:
@@ -246,7 +245,7 @@ def _frozen(od: Array) -> Mask:
 
 
 def _gaps(time: Array) -> list[int]:
-    """Return the positions before which the recording pauses."""
+    """Return the position of the first row after each gap."""
     step = np.diff(time)
     if not len(step):
         return []
@@ -254,7 +253,7 @@ def _gaps(time: Array) -> list[int]:
 
 
 def _jumps(series: Series, slow: Array) -> list[int]:
-    """Return the positions of the first reading after a persistent jump."""
+    """Return the position of the first reading after each persistent jump."""
     valid = np.flatnonzero(np.isfinite(series.od))
     if len(valid) < 2 * JUMP_ROWS:
         return []
@@ -275,7 +274,9 @@ def _jumps(series: Series, slow: Array) -> list[int]:
 
 
 def _foreign_regimes(series: Series, slow: Array, jumps: list[int]) -> Iterator[tuple[int, int, str]]:
-    """Return (first, end, reason) of every regime but the one with most readings; short bursts are bridged."""
+    """Yield (first, end, reason) of each burst and of each regime except the one with the most readings.
+
+    A burst is a short part after which the OD returns to its trend; the regimes around it are joined."""
     regimes = [[(a, b)] for a, b in zip([0, *jumps], [*jumps, len(series.od)], strict=True)]
     readings = [int(np.isfinite(series.od[r[0][0] : r[0][1]]).sum()) for r in regimes]
     bursts: list[tuple[int, int]] = []
@@ -309,10 +310,10 @@ def _jump_reason(series: Series, at: int, later: bool) -> str:
     before = np.flatnonzero(np.isfinite(series.od[:at]))[-1]
     after = at + np.flatnonzero(np.isfinite(series.od[at:]))[0]
     what = (
-        f"OD goes from {series.od[before]:.3g} to {series.od[after]:.3g} between rows {series.row[before]} and "
-        f"{series.row[after]} ({series.time[after] - series.time[before]:.1f} min), which no culture does, and does "
-        "not come back"
+        f"OD jumps from {series.od[before]:.3g} to {series.od[after]:.3g} between rows {series.row[before]} and "
+        f"{series.row[after]} ({series.time[after] - series.time[before]:.1f} min), faster than any culture, and does "
+        "not return"
     )
     rose = series.od[after] > series.od[before]
-    side = "from there on" if later else "up to there"
-    return f"sensor broken or moved {side}: {what}" if rose == later else f"another regime {side}: {what}"
+    side = "after a jump" if later else "before a jump"
+    return f"sensor broken or moved {side}: {what}" if rose == later else f"different conditions {side}: {what}"

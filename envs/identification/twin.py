@@ -1,12 +1,12 @@
-"""The plant behind a recording: mu(t) and tau(t), noise of the sensor, spread of doses, outliers.
+"""Twin of a recorded culture, a plant fitted to it: mu(t), tau(t), sensor noise, random errors of doses, outliers.
 
 k(t) = 1/tau(t) is a smooth curve through the estimates of the segments, which are valid for every pump control. With
-k(t), the remaining change of the readings is growth,
+the doses corrected by k(t), the remaining change of the readings is growth,
 
     g_i = ln y_i + sum over j < i of k(t_j) c_j = b + integral of mu + s_i + v_i,     c_j = u_j dt_j
 
-where the spread of doses makes s a random walk and v is the noise of the readings, both from the window's estimate.
-mu(t) is a smooth curve like k(t): a line plus a random walk, whose size is estimated.
+s is a random walk by the random errors of the doses, v the noise of the readings; the sizes of both come from the
+estimate of the window. mu(t) is a smooth curve like k(t): a line plus a random walk, whose size is estimated.
 """
 
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ from envs.identification.verdict import Calibration
 
 Array = NDArray[np.float64]
 
-FEWEST_SEGMENTS = 4  # segments with a tau; with fewer tau is the returned one throughout
-WANDER = np.concatenate([[0.0], np.geomspace(0.005, 0.3, 12)])  # of a curve about its line: sd after 1 h over its mean
-FLAT = 25.0  # prior variance of levels, and of a line's two coefficients over the mean: very wide
-BLOCKS = 400  # of rows at most, whose means are compared with mu(t)
-EXACT = 1e-8  # least variance of ln y of a reading: 0.01 % of the OD
-OUTLIER_OD = 0.04  # least deviation of an outlier (docs/biology.md, Sensor)
+FEWEST_SEGMENTS = 4  # segments with an estimate of tau; with fewer, tau is constant
+WANDER = np.concatenate([[0.0], np.geomspace(0.005, 0.3, 12)])  # sizes of the random walk: sd after 1 h over the mean
+FLAT = 25.0  # prior variance of levels, and of both coefficients of a line relative to the mean: very wide
+BLOCKS = 400  # largest number of blocks of rows; their means are compared with mu(t)
+EXACT = 1e-8  # smallest variance of ln y of a reading: 0.01 % of the OD
+OUTLIER_OD = 0.04  # smallest deviation of an outlier (docs/biology.md, Sensor)
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A parameter at the knots with its 95 % band, straight between them; shape (J,) each."""
+    """Values of a parameter at the J knots with the 95 % band low to high; linear between the knots."""
 
     value: Array
     low: Array
@@ -40,10 +40,10 @@ class Course:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise between a noise-free plant and the readings.
+    """Noise of the readings and the doses.
 
-    The sd of a reading is hypot(floor, relative * OD), its correlation from row to row lag1. dose_cv: sd of a dose over
-    its mean. outlier_rate: fraction of readings off by more than 0.04 OD.
+    floor, relative: the sd of a reading is hypot(floor, relative * OD). lag1: correlation of the noise from row to row.
+    dose_cv: sd of a dose relative to its mean. outlier_rate: fraction of readings that are off by 0.04 OD or more.
     """
 
     floor: float
@@ -55,10 +55,10 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A recording as a plant; knot_min counts from its first trustworthy row, shape (J,); rows are [first, end).
+    """Plant fitted to a recording.
 
-    start_od: OD at the first row. row_min: median time between rows. drifts: whether tau may drift.
-    """
+    knot_min: min from the first trustworthy row to each knot, (J,). start_od: OD at the first row. rows: row numbers
+    [first, end). row_min: median time between rows, min. drifts: whether tau(t) may vary."""
 
     knot_min: Array
     mu: Course
@@ -71,11 +71,11 @@ class Twin:
 
 
 def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
-    """Fit the plant behind all trustworthy rows of a calibrated recording, a knot about every `knot_every_min` min.
+    """Fit a plant to all trustworthy rows of a calibrated recording, with a knot about every `knot_every_min` min.
 
-    For a recording of more than a week it covers the window.
+    For a recording of more than a week, fit only the rows of the window.
 
-    Args: raw: the recording before screening, at the same positions as `result`'s.
+    Args: raw: the recording before screening, with the same rows as in `result`.
     """
     edges = result.screened.stretches
     first, end = edges[0][0], edges[-1][1]
@@ -106,9 +106,9 @@ def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
 
 
 class _Rows:
-    """Screened rows, n of them, and the integrals of the knots' hat functions up to each, shape (n, J).
+    """The n screened rows and, up to each row, integrals of the J hat functions of the knots, shape (n, J).
 
-    elapsed: of the hat itself, min. pumped: of the pump rate times it, mL/s min. stretch: number of each row's stretch.
+    elapsed: integral of the hat, min. pumped: of pump rate times hat, mL/s min. stretch: stretch index of each row.
 
     Args: part: the rows. starts: positions at which a stretch begins. knots: min after the first row, (J,).
     """
@@ -130,12 +130,12 @@ class _Rows:
         self.full, self.count = count > 0.0, count[count > 0.0]
 
     def means(self, values: Array) -> Array:
-        """Means of (n, C) values over the readings of each block that has any, shape (blocks, C)."""
+        """Return the means of values (n, C) over the readings of each block, (blocks, C), without empty blocks."""
         sums = np.add.reduceat(np.where(self.seen[:, None], values, 0.0), self.blocks, axis=0)
         return np.asarray(sums[self.full] / self.count[:, None])
 
     def grown(self, k: Array) -> Array:
-        """Compute g of the module's docstring, between readings on a straight line, shape (n,)."""
+        """Compute g of the module's docstring, shape (n,); linear between readings."""
         at = np.flatnonzero(self.seen)
         return np.asarray(np.interp(np.arange(len(self.seen)), at, (self.log_od + self.pumped @ k)[at]))
 
@@ -145,16 +145,16 @@ class _Rows:
 
 
 def _summed(steps: Array) -> Array:
-    """Sum the contributions of all earlier rows, shape (n, J)."""
+    """Return the sum of the steps of all earlier rows, shape (n, J)."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps[:-1], axis=0)])
 
 
 def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) -> tuple[Array, Array, Array]:
     """Fit a line plus a random walk at P points to n linear observations, averaged over the size of the walk.
 
-    Args: at_h: hours, (P,). mean: scale of the curve. seen: observations, (n,). towards: their weights on the points,
-      (n, P). noise: covariance of their errors, (n, n).
-    Returns: the curve (P,), its covariance (P, P), and how it follows from `seen`, (P, n).
+    Args: at_h: the points, hours, (P,). mean: scale of the curve. seen: observations, (n,). towards: weights of the
+      points in each observation, (n, P). noise: covariance of the observations' errors, (n, n).
+    Returns: the curve (P,), its covariance (P, P), and its derivative by `seen`, (P, n).
     """
     since = at_h - at_h.min()
     scores, gains, left = [], [], []
@@ -176,9 +176,9 @@ def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) 
 
 
 def _inverse_tau(result: Calibration, at: Array) -> tuple[Array, Array, bool]:
-    """Estimate k at times in min, shape (J,), its covariance (J, J), and whether its drift is identifiable.
+    """Estimate k at times `at`, min, (J,), its covariance (J, J), and whether its drift is identifiable.
 
-    Before the first and after the last segment with a tau, k is constant.
+    Before the first and after the last segment with an estimate of tau, k is constant.
     """
     known = [(s.middle_min, s.tau) for s in result.segments if s.tau is not None]
     if len(known) < FEWEST_SEGMENTS:
@@ -199,7 +199,7 @@ def _inverse(tau: Parameter) -> tuple[float, float]:
 
 
 def _growth(rows: _Rows, k: Array, k_cov: Array, noise: Noise, mean: float) -> tuple[Array, Array]:
-    """Estimate mu at the knots, shape (J,), and its covariance, that of k included; rows count as means of blocks."""
+    """Estimate mu at the knots, (J,), from means of blocks, and its covariance, which includes that of k."""
     walked = rows.means(_summed(((noise.dose_cv * rows.doses(k)) ** 2)[:, None]))[:, 0]
     reading = np.hypot(noise.floor / np.where(rows.seen, rows.part.od, 1.0), noise.relative)
     longer = (1.0 + noise.lag1) / (1.0 - noise.lag1)
@@ -215,7 +215,7 @@ def _growth(rows: _Rows, k: Array, k_cov: Array, noise: Noise, mean: float) -> t
 
 
 def _outliers(rows: _Rows, k: Array, raw: Series) -> float:
-    """Return the fraction of rejected readings that are far from their neighbours."""
+    """Return the fraction of all readings that were rejected and are far from the fitted curve."""
     rejected = np.isfinite(raw.od) & ~np.isfinite(rows.part.od)
     far = np.abs(raw.od - np.exp(rows.grown(k) - rows.pumped @ k)) >= OUTLIER_OD
     return float((rejected & far).sum() / np.isfinite(raw.od).sum())

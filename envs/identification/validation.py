@@ -1,4 +1,4 @@
-"""Predictions by a pair (mu, tau) of readings outside its fit, about an hour ahead each."""
+"""Validation: predictions with a pair (mu, tau) of readings that were not fitted, about an hour ahead."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,18 +14,17 @@ from envs.identification.screening import OD_FLOOR, Screened, Series, pumped_vol
 
 Array = NDArray[np.float64]
 
-START_READINGS = 5  # readings that set the start of a prediction and are not scored
+START_READINGS = 5  # readings that determine the start of a prediction; they are not scored
 AHEAD_MIN = (30.0, 60.0)
 SLOPE_MIN = 20.0
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """RMS error, % of OD, of predictions `minutes` ahead of n readings of the second half.
+    """RMS errors, % of OD, of predictions of n readings in the second half, `minutes` before each reading.
 
-    model_pct: by the model fitted to the first half. od_stays_pct: by a constant OD. same_slope_pct: by the growth of
-    ln OD over the 20 min before.
-    """
+    model_pct: predicted by the model fitted to the first half. od_stays_pct: by a constant OD. same_slope_pct: by a
+    constant slope of ln OD, that of the 20 min before."""
 
     minutes: float
     model_pct: float
@@ -36,11 +35,11 @@ class Ahead:
 
 @dataclass(frozen=True)
 class Validation:
-    """PMSE of predictions, each from a fresh start every horizon, %; None without such readings.
+    """PMSE of predictions, which start anew after each horizon, %; None without readings to predict.
 
-    holdout_pct: the pair of the window's first 70 % on its last 30 %. early_pct: the same pair on its own rows.
-    outside_pct: the returned pair on the trustworthy rows outside the window. ahead: the first half of all trustworthy
-    rows predicts the second, beside two guesses; empty where the first half tells no pair.
+    holdout_pct: the pair of the window's first 70 % predicts its last 30 %. early_pct: the same pair predicts the 70 %.
+    outside_pct: the returned pair predicts the trustworthy rows outside the window. holdout_n, outside_n: number of
+    predicted readings. ahead: the first half predicts the second; empty if the first half does not identify a pair.
     """
 
     holdout_pct: float | None
@@ -52,7 +51,7 @@ class Validation:
 
 
 def validate(screened: Screened, window: tuple[int, int], pair: tuple[float, float], horizon_min: float) -> Validation:
-    """Score a pair (mu in 1/min, tau), and the pair of the window's first part."""
+    """Score the predictions of a pair (mu in 1/min, tau), and of the pair fitted to the window's first 70 %."""
     clean, (a, b) = screened.series, window
     cut = a + int(0.7 * (b - a))
     first = _pair(clean.part(a, cut))
@@ -65,7 +64,7 @@ def validate(screened: Screened, window: tuple[int, int], pair: tuple[float, flo
 
 
 def _ahead(screened: Screened) -> Iterator[Ahead]:
-    """Predict the second half by the pair of the first; a start is the median of five readings on its course."""
+    """Predict the second half with the pair of the first half; a prediction starts at the median of five readings."""
     clean = screened.series
     half = float(0.5 * (clean.time[0] + clean.time[-1]))
     pair = _pair(clean.part(0, int(np.searchsorted(clean.time, half))))
@@ -92,10 +91,10 @@ def _ahead(screened: Screened) -> Iterator[Ahead]:
 
 
 def attainable_pct(found: Estimate, part: Series, horizon_min: float) -> float:
-    """Return the PMSE over a horizon caused by the disturbances of an estimate, %.
+    """Return the PMSE over a horizon that the disturbances of an estimate cause, %.
 
-    Doses off by e_i leave the sum of k c_i e_i in ln x, growth off by w over the horizon H leaves w t:
-    100 (half the variance of all doses in H + (mu w H)^2 / 3).
+    Relative errors e_i of the doses add sum k c_i e_i to ln x; an error w of growth over the horizon H adds mu w t. The
+    PMSE is 100 (half the variance by all doses in H + (mu w H)^2 / 3).
     """
     volume = part.pump_rate[:-1] * np.diff(part.time) * found.inverse_tau.value
     rows = horizon_min / float(np.median(np.diff(part.time)))
@@ -107,7 +106,7 @@ def attainable_pct(found: Estimate, part: Series, horizon_min: float) -> float:
 def _scored(
     clean: Series, places: list[tuple[int, int]], pair: tuple[float, float], horizon: float
 ) -> tuple[float | None, int]:
-    """PMSE in % and number of readings of free runs over the places, each horizon from its first five readings."""
+    """Return PMSE, %, and number of readings of free runs; each starts from the first five readings of a horizon."""
     od, predicted = [np.empty(0)], [np.empty(0)]
     for part in (clean.part(*cut) for place in places for cut in cuts(clean, *place, horizon)):
         seen = np.flatnonzero(np.isfinite(part.od))
@@ -122,6 +121,6 @@ def _scored(
 
 
 def _pair(part: Series) -> tuple[float, float] | None:
-    """Estimate a pair; None where a series tells none."""
+    """Estimate the pair (mu, tau) of a series; None if it is not identifiable."""
     mu, tau = pairs([part])[0] if enough(part) else (None, None)
     return None if mu is None or tau is None else (mu.value, tau.value)

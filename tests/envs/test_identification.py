@@ -196,8 +196,8 @@ WILD = np.random.default_rng(4).uniform(0.0, 3.0, 121)
     ("rows", "fault", "reason", "lost"),
     [
         (slice(150, 158), lambda y: y + 0.6, "burst", range(150, 158)),
-        (slice(250, None), 6.0, "sensor broken or moved from there on", range(249, 361)),
-        (slice(250, None), 0.2, "another regime from there on", range(249, 361)),
+        (slice(250, None), 6.0, "sensor broken or moved after a jump", range(249, 361)),
+        (slice(250, None), 0.2, "different conditions after a jump", range(249, 361)),
         (slice(240, None), lambda y: WILD, "sensor noisy", None),
     ],
 )
@@ -275,7 +275,7 @@ def test_the_window_is_the_stretch_with_most_readings_not_with_most_rows() -> No
         Segment(a, b, time[a:b].mean(), known, known) for a, b in ((0, 90), (90, 181), (181, 241), (241, 302))
     )
     found, why = choose_window(Screened(clean, ((0, 181), (181, 302)), ()), along, 60.0)
-    assert (found, why) == ((181, 302), "the longest stretch without a pause")
+    assert (found, why) == ((181, 302), "the longest part without a pause")
     assert longest(Screened(clean, ((0, 181), (181, 302)), ())) == (181, 302)
 
 
@@ -306,7 +306,7 @@ def test_drift_is_found_and_kept_out_of_the_window() -> None:
     inside = slice(*result.window_rows)
     assert result.tau.low < tau[inside][pump_rate[inside] > 0].mean() < result.tau.high
     assert result.validation.outside_pct is not None
-    with pytest.raises(NotIdentifiable, match="a culture that drifts"):
+    with pytest.raises(NotIdentifiable, match="a drifting culture"):
         calibrate(series(time, od, pump_rate), IdentifyConfig(window="all", method="free_run"))
 
 
@@ -392,7 +392,7 @@ def test_growth_and_light_are_those_of_each_temperature_that_was_held() -> None:
     assert found[0].light is not None
     assert found[0].light.value == pytest.approx(2000.0)
     assert found[1].light is None
-    assert left == ["36.0 degC from minute 540 on: held for 40 min, it takes 180"]
+    assert left == ["36.0 degC from minute 540 on: constant for 40 min, at least 180 are needed"]
 
 
 # ---------------------------------------------------------------- the real recording

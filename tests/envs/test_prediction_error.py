@@ -296,7 +296,7 @@ def test_stopping_the_pump_for_ten_minutes_every_hour_is_a_remedy() -> None:
 def test_feedback_speaks_against_a_free_run_alone() -> None:
     draw = regulated(1, dose_cv=0.1, growth_cv=0.05)[0]
     result = calibrate(draw)
-    assert not any("answers the readings" in w for w in result.warnings)
+    assert not any("responds to the readings" in w for w in result.warnings)
     assert result.mu.low <= MU <= result.mu.high
     paper = calibrate(draw, IdentifyConfig(method="free_run"))
     assert paper.mu.high < 0.8 * MU

@@ -82,7 +82,7 @@ def test_ten_readings_above_zero_are_needed(left: int, empty: float, enough: boo
     if enough:
         assert changed(s, od).stretches == ((0, 10),)
     else:
-        with pytest.raises(ValueError, match="9 trustworthy readings above zero are left, at least 10"):
+        with pytest.raises(ValueError, match="9 trustworthy readings above zero, at least 10"):
             changed(s, od)
 
 

@@ -226,7 +226,7 @@ def test_the_next_reading_is_what_the_model_makes_of_this_one() -> None:
 @pytest.mark.parametrize("hours", [1.5, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_a_model_that_holds_is_left_alone(hours: float) -> None:
     for found in compared(SOUND, hours, 20):
-        assert found.verdict().startswith("No need to recalibrate: the model held to the end of the run")
+        assert found.verdict().startswith("No need to recalibrate: the model was right to the end of the run")
         assert found.attainable == pytest.approx(found.rms, rel=0.02)
 
 
@@ -238,7 +238,7 @@ def test_growth_that_rises_is_told_from_the_hour_on_at_which_it_matters() -> Non
         assert found.net.latest.value == pytest.approx(0.03 * 0.04 * 7.0, rel=0.15)  # mean of the last two hours
         assert found.verdict().startswith("Recalibrate: ")
         unused = found.verdict(planned=False)
-        assert unused.startswith("This run needs no calibration, and its culture is not the model: ")
+        assert unused.startswith("This run needs no calibration, but its culture differs from the model: ")
         assert unused.endswith(found.verdict().removeprefix("Recalibrate"))
         assert "the predicted net growth is off by 10 % or more since hour " in found.verdict()
         assert found.attainable < 0.95 * found.rms
@@ -272,7 +272,7 @@ def test_net_growth_is_per_minute_also_where_rows_are_two_minutes_apart() -> Non
 
 def test_a_short_run_says_that_it_is_too_short() -> None:
     for found in compared(replace(SOUND, growth=GrowthConfig(mu=0.05)), 0.75):
-        assert found.verdict() == "Too short to tell: 45 min of trustworthy readings, at least 60 are needed."
+        assert found.verdict() == "Too short for a comparison: 45 min of trustworthy readings, at least 60 are needed."
 
 
 def test_nothing_is_predicted_across_a_pause() -> None:

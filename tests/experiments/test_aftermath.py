@@ -59,7 +59,7 @@ def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
     text = sections(copy)
     assert "Predicted and measured" in text
     assert "growth 0.03 1/min, tau 0.3333 (nominal)" in text
-    of = r"This run needs no calibration, and its culture is not the model: "
+    of = r"This run needs no calibration, but its culture differs from the model: "
     assert len(re.findall(of + ".*?the predicted net growth is off by 10 % or more since hour", text)) == 2
     assert "ecalibrate" not in text  # nobody fitted the nominal model
     # in the first two hours growth is off by 6 % in the mean, in the next two by 18 %
@@ -103,9 +103,9 @@ def test_a_recording_that_cannot_be_compared_says_why(copy, tmp_path):
     path.write_text("\n".join(path.read_text().splitlines()[:5]) + "\n")
     text = sections(copy)
     assert text.count("Not compared: ") == 1
-    assert text.count("its culture is not the model: ") == 1
+    assert text.count("its culture differs from the model: ") == 1
     short = deployed(tmp_path / "short", "controller=pi", "scenario.minutes=[8,8,8]")
-    assert "Too short to tell: " in sections(short)
+    assert "Too short for a comparison: " in sections(short)
 
 
 @pytest.mark.slow
@@ -152,7 +152,7 @@ def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
     vials = "backend.reactors=[M0,M1]", "bench.volume_ml=14", "bench.volumes_ml.M1=9", "scenario.minutes=[80,80,80]"
     text = sections(deployed(tmp_path / "run", "controller=inverse", *vials))
     assert "tau 0.2333, 0.15 of M1 (nominal)" in text
-    assert text.count("needs no calibration: the model held to the end of the run.") == 2
+    assert text.count("needs no calibration: the model was right to the end of the run.") == 2
     gains = re.findall(r"the pump&#39;s gain: last ([\d.]+) \(([\d.]+) to ([\d.]+)\), the model&#39;s 1 ", text)
     assert len(gains) == 2
     for gain, low, high in gains:

@@ -198,7 +198,7 @@ def test_a_recording_without_tau_leaves_mu_and_what_to_do(plain: Cli, summary_of
     content = summary_of()
     for part in ("word", "why", "then"):
         assert content["verdict"][part] in str(caught.value)
-    assert "mu alone is 0.00" in str(caught.value)
+    assert "mu is 0.00" in str(caught.value)
     assert content["verdict"]["word"] == "record again"
     assert (content["mu"], content["tau"]) == (None, None)
     assert content["mu_alone"]["ci95"][0] <= 0.009 <= content["mu_alone"]["ci95"][1]
