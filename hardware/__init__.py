@@ -1,4 +1,4 @@
 """Everything that touches time, wires or liquid.
 
-Reactor, errors and clock are what all rooms share; each room beside them says who may enter.
+All packages here share `reactor`, `errors` and `clock`; the docstring of each package names its users.
 """

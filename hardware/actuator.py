@@ -1,4 +1,4 @@
-"""What acts on a culture, declared: its name, the unit of a command, its limits, and which pump it is, if any."""
+"""Actuators: the name, the unit and limits of a command, and the pump number."""
 
 import math
 from dataclasses import dataclass
@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Actuator:
-    """One thing that a signal of the control loop commands; a reactor family lists those that it has.
+    """A pump, thermostat or other device that a signal of the control loop commands; a reactor family lists its own.
 
-    A fluid's command is a mean rate: what it comes to is given in doses, in the feed's place, and each of them passes
-    the interlock and its ledger. A temperature stands in place of the schedule's. Any other command reaches the
+    A pump's command is a mean rate. It is given as doses that replace feed doses, and each dose passes the interlock
+    and its ledger. A temperature command replaces the temperature of the schedule. Any other command reaches the
     reactors as `Command.targets[name]`.
 
-    low, high: limits in its unit, to which the interlock cuts a command; those of a fluid are 0 and the bench's largest
-    rate, those of the thermostat are settings of the interlock. pump: its number, 0 for what is no fluid.
+    low, high: limits to which the interlock cuts a command, except for pumps (0 to the bench's largest rate) and the
+    thermostat (settings of the interlock). pump: number of the pump, 0 if it is none.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Time as an argument: real time, device time, a clock that moves only when somebody sleeps; the time of a run."""
+"""Clocks for real time, device time and virtual time, and the time of a run."""
 
 import math
 import time
@@ -15,7 +15,7 @@ class Clock(Protocol):
     """Seconds on a monotonic clock, and a way to wait."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary start; never goes back."""
+        """Return the seconds since an arbitrary start; they never decrease."""
 
     def sleep(self, seconds: float) -> None:
         """Wait; `seconds` <= 0 returns at once."""
@@ -38,7 +38,7 @@ class RealClock:
 class DeviceClock:
     """Device time, for samples, doses and the run: `speed` device seconds pass in one real second, 1 on the bench.
 
-    No other module converts between the two. Args: real: clock that it runs on; None: the machine's.
+    No other module converts between the two. Args: real: clock of real time; None: the computer's.
     Raises: ValueError if speed is not positive.
     """
 
@@ -54,11 +54,11 @@ class DeviceClock:
         self.real.sleep(self.to_real(seconds))
 
     def of_real(self, real_s: float) -> float:
-        """Device seconds that pass in `real_s` real seconds; device time at a real time."""
+        """Convert real seconds, or a real time, to device seconds."""
         return real_s * self._speed
 
     def to_real(self, device_s: float) -> float:
-        """Real seconds in which `device_s` device seconds pass."""
+        """Convert device seconds to real seconds."""
         return device_s / self._speed
 
 
@@ -77,7 +77,7 @@ class VirtualClock:
 
 
 def boot() -> str:
-    """Return the name of this computer's present boot, "" where the system does not tell."""
+    """Return the id of this computer's current boot, "" if the system has none."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
@@ -106,8 +106,8 @@ def run_time(
     clock does, which may have been set. A clock with a result outside the bounds is not used; the result is limited to
     the bounds and never before that row.
 
-    Args: rows: of its journal. speed: device seconds per real second; 0: virtual time, which stands still while no
-      program runs. low_s, high_s: bounds on the run time by the devices.
+    Args: rows: rows of the journal. speed: device seconds per real second; 0: virtual time, which stops while no
+      program runs. low_s, high_s: bounds on the run time, from the devices, s.
     """
     last = max(rows, key=lambda row: float(row.get("time_s") or 0.0), default={})
     known_s = float(last.get("time_s") or 0.0)

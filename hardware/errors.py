@@ -1,7 +1,7 @@
-"""Everything that can go wrong with a reactor, as one tree; catch `ReactorError` widely or a leaf narrowly.
+"""Errors of reactors, as one tree of classes: catch `ReactorError` for all errors, or a subclass.
 
-Every message names the thing, its value with unit, the allowed range and the remedy. A leaf declares its sentence
-(`conf.messages`); the classes below also take a text.
+Every message names the thing, its value with unit, the allowed range and the remedy. A message class declares its
+sentence (`conf.messages`); the base classes below also take a text.
 """
 
 from conf.messages import Message
@@ -16,11 +16,11 @@ class LinkError(ReactorError):
 
 
 class ProtocolError(ReactorError):
-    """The device answered something that is not its protocol: malformed JSON, wrong status, bad frame."""
+    """The device's answer does not follow its protocol: malformed JSON, wrong status, bad frame."""
 
 
 class DeviceStateError(ReactorError):
-    """The device answered well, but is not in the state it must be in: pump still on, mode active, absent."""
+    """The device answered correctly but is not in the required state: pump still on, mode active, reactor absent."""
 
 
 class IdentityError(DeviceStateError):
@@ -36,4 +36,4 @@ class RecordingError(ReactorError):
 
 
 class UnfitError(ReactorError):
-    """What a config asks for does not fit this kind of reactor, or a file of its calibration is damaged."""
+    """A config requests something that this kind of reactor cannot do, or a calibration file is damaged."""

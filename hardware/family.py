@@ -1,6 +1,6 @@
-"""A kind of reactor as one object: its config, how it is opened and checked, what it can do, what a run may ask of it.
+"""A family of reactors as one object: its config, how to open and check it, its abilities and its limits.
 
-The kinds that come with the program are loaded when they are asked for; `add` makes a further one known.
+The families that come with the program are loaded at their first use; `add` registers a further family.
 """
 
 import logging
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Check:
-    """One line: what was checked, whether it passed, what was seen, what to do. `required` ones stop a run."""
+    """One check before a run: name, result, what was seen, remedy. If it is `required`, its failure stops the run."""
 
     name: str
     ok: bool
@@ -59,9 +59,9 @@ def report(checks: Sequence[Check]) -> None:
 class Can:
     """What the reactors of a family can do.
 
-    fluorescence: measure it. spare_pumps: numbers of those that give a fluid of their own.
-    thermostat: hold the temperature that a step asks for. regulation: hold an OD by themselves. resume: go on after the
-    program was killed.
+    fluorescence: measure fluorescence. spare_pumps: numbers of the pumps that can give another fluid.
+    thermostat: hold the temperature of a scenario step. regulation: hold an OD without this program. resume: continue a
+    run after the program was killed.
     """
 
     fluorescence: bool = False
@@ -75,9 +75,9 @@ class Can:
 class Opening:
     """Everything that a family needs to open its reactors.
 
-    backend: its config. bench: volume, period and pump. plant: of simulated vials. journal: of the run; a driver writes
-    every command into it before sending the command; `journal.rows` holds the rows written before an interruption.
-    folder: of the run. resumed: whether this run continues an earlier one.
+    backend: the family's config. bench: volume, period and pump. plant: config of simulated vials. journal: the run's
+    journal. A driver writes every command into it before sending the command; `journal.rows` holds the rows written
+    before an interruption. folder: the run's folder. resumed: whether this run continues an earlier run.
     """
 
     backend: Any
@@ -98,7 +98,7 @@ class Opening:
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
     def elapsed_s(self, speed: float = 1.0, low_s: float = 0.0, high_s: float = math.inf) -> float:
-        """Return the run time that has passed, s; 0 in a new run; warn of a doubtful clock. Args: as of `run_time`."""
+        """Return the run time that has passed, s; 0 in a new run; warn of a doubtful clock. Args: as in `run_time`."""
         found = run_time(self.journal.rows, speed, low_s, high_s)
         if found.step_s:
             log.warning(messages.ClockMoved(by_min=found.step_s / 60.0, minute=found.s / 60.0))
@@ -109,12 +109,12 @@ class Opening:
 
 
 class Family:
-    """One kind of reactor. What a kind of one's own must give is `config` and `open`; the rest has defaults.
+    """One kind of reactor. A new family must define `config` and `open`; the rest has defaults.
 
-    Attributes: config, dataclass of its values, whose fields are made by `conf.schema.setting`; it needs `kind`, the
-      name of the family, and `reactors`, their names. can: what its reactors can do. called: its reactors, for a
-      reader. at_stake: a culture is: a policy that is doubtful or not certified is refused. simulated: its vials are of
-      `plant`, in this process and in virtual time, and the program knows their truth.
+    Attributes: config: dataclass of the family's settings, with fields made by `conf.schema.setting`; it needs `kind`,
+      the family's name, and `reactors`, the reactors' names. can: abilities of the reactors. called: name of the
+      reactors in texts. at_stake: a culture is at risk, so a doubtful or uncertified policy is refused. simulated: the
+      vials are those of `plant`, in this process and in virtual time, and their true state is known.
     """
 
     config: type[Any]
@@ -126,16 +126,16 @@ class Family:
     def open(self, opening: Opening) -> AbstractContextManager[Reactor]:
         """Open the reactors of a run: ready inside the context, released after it. Raises, on entering: ReactorError.
 
-        What is dosed must be in the journal before it is done, and `Reactor.pumps_off` must say what it could not
-        verify. A new run is checked first, a resumed one goes on from `opening.earlier()`.
+        A dose must be in the journal before it begins, and `Reactor.pumps_off` must return what it could not verify.
+        A new run is checked first; a resumed run continues from `opening.earlier()`.
         """
         raise NotImplementedError
 
     def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
-        """Check what a run needs, a line for each thing; opens and closes what that takes. Raises: ReactorError.
+        """Check everything that a run in `folder` needs; return one line for each check. Raises: ReactorError.
 
-        A family that does not say how is opened as for a run, which writes into `folder`; each reactor is sampled once,
-        and its pumps are verified off.
+        By default the reactors are opened as for a run, with a temporary journal; each reactor is sampled once, and its
+        pumps are verified off.
         """
         checks: list[Check] = []
         with tempfile.TemporaryDirectory() as name, closing(Journal(Path(name) / "journal.jsonl", fsync=False)) as rows:
@@ -147,10 +147,10 @@ class Family:
         return checks
 
     def fits(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario], ends: Sequence[str]) -> None:
-        """Whether a run may ask this of the reactors; refused before a device is asked.
+        """Check that the reactors can do what a run requests, before the program contacts a device.
 
-        Args: scenarios, ends: one per reactor; ends as of deploy's `at_end`.
-        Raises: UnfitError naming the backend, what it lacks or what differs, and the remedy.
+        Args: scenarios, ends: one per reactor; ends as in deploy's `at_end`.
+        Raises: UnfitError naming the backend, the missing ability or wrong value, and the remedy.
         """
         where = f"backend={backend.kind}"
         asked = sorted({t for s in scenarios for t in s.temperatures if t is not None and math.isfinite(t)})
@@ -163,70 +163,70 @@ class Family:
         self.gives(backend, bench, [s.supplied for s in scenarios], "scenario.outputs")
 
     def no_thermostat(self, backend: Any) -> str | None:
-        """None if the temperature is controlled; else what is missing for that, behind "controls none"."""
+        """Return None if the temperature is controlled, else what is missing, as a text to follow "controls none"."""
         return None if self.can.thermostat else ""
 
     def doses(self, backend: Any, bench: Bench) -> None:
-        """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
+        """Check that the bench's period, volumes and largest rate suit the reactors. Raises: UnfitError."""
 
     def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
-        """Whether spare pumps, by number for each reactor, can give what `who`, a key, asks for. Raises: UnfitError."""
+        """Check that spare pumps, by number for each reactor, can serve the config key `who`. Raises: UnfitError."""
         if not any(pumps):
             return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
         if most_ml < needed:
-            remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more beside {who}"
+            remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more with {who}"
             raise UnfitError(f"bench.max_rate = {bench.max_rate:g} mL/s: {remedy}")
         if bench.control_min > MADE_UP_MIN:
-            remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s beside {who}"
+            remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s with {who}"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {remedy}")
         for name, asked in zip(backend.reactors, pumps, strict=True):
             for number in sorted(asked):
                 if number not in self.can.spare_pumps:
-                    raise UnfitError(f"{who}: backend={backend.kind} has no pump {number} to spare; drop it")
+                    raise UnfitError(f"{who}: backend={backend.kind} has no spare pump {number}; remove it")
                 self.tube(backend, number, most_ml, f"{who} of {name}")
 
     def tube(self, backend: Any, number: int, most_ml: float, who: str) -> None:
-        """Whether a spare pump has a tube, and can give `most_ml`. Raises: UnfitError, naming who asks for it."""
+        """Check that a spare pump has a tube and can give doses of `most_ml`. Raises: UnfitError, naming `who`."""
 
     def actuators(self, backend: Any) -> tuple[Actuator, ...]:
-        """List what signals of the control loop may command."""
+        """List the actuators that signals of the control loop may command."""
         heat = (THERMOSTAT,) if self.no_thermostat(backend) is None else ()
         return (FEED, *heat, *(SPARE[number] for number in self.can.spare_pumps))
 
     def holding(self, backend: Any, preset: str, **values: Any) -> Any:
-        """Put a preset of vials, and values, into a config that simulates vials of its own, where none was chosen."""
+        """Return a config with a plant preset and values, if it simulates its own vials and none were chosen."""
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
-        """Of cultures in software the config key that chooses them, and what they are. Args: plant: deploy's own."""
+        """Return the config key of simulated cultures and their config, or None. Args: plant: deploy's plant config."""
         return None
 
     def sees_fluorescence(self, backend: Any) -> bool:
         return False
 
     def seeing_fluorescence(self, backend: Any) -> Any:
-        """Return the config by which fluorescence is measured."""
+        """Return the config with the measurement of fluorescence on."""
         return backend
 
     def rim_ml(self, volumes_ml: Array) -> Array | float:
-        """Return what a vial holds, mL, inf where that is not known. Args: volumes_ml: of the cultures, (N,)."""
+        """Return the capacity of the vials, mL, inf if unknown. Args: volumes_ml: volumes of the cultures, (N,)."""
         return math.inf
 
     def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
-        """Return the vials themselves, where the program knows them, and the assumed flow of their pump, mL/s."""
+        """Return the simulated vials, or None, and the flow that a run assumes of their feed pump, mL/s."""
         return None, 1.0
 
     def address(self, backend: Any) -> str:
-        """Where the reactors are, for a reader."""
-        return str(getattr(backend, "url", "")) or "address not said"
+        """Return where the reactors are, as a text for the user."""
+        return str(getattr(backend, "url", "")) or "unknown address"
 
     def start_od(self, backend: Any, plant: PlantConfig) -> float:
-        """Return the OD that cultures start from, as far as it is known beforehand; else 0."""
+        """Return the OD at which the cultures start, 0 if unknown."""
         return 0.0
 
     def unmeasured(self, backend: Any) -> str:
-        """List what was not measured on the bench and is assumed, in a line; "" for nothing. Raises: UnfitError."""
+        """Return a line with the values that are assumed, not measured on the bench; "" if none. Raises: UnfitError."""
         return ""
 
 
@@ -268,7 +268,7 @@ SHIPPED: Mapping[str, str] = {
     "pioreactor": "hardware.pioreactor.family",
     "pioreactor_rig": "hardware.rig.family",
 }
-"""The module of each kind that comes with the program; its FAMILY is the object."""
+"""Module of each family that comes with the program; its FAMILY is the family."""
 _loaded: dict[str, Family] = {}
 
 
@@ -277,7 +277,7 @@ def known() -> list[str]:
 
 
 def family(kind: str) -> Family:
-    """Return the family of this name. Raises: ValueError naming those there are."""
+    """Return the family of this name. Raises: ValueError naming the known families."""
     if kind not in known():
         raise ValueError(f"backend.kind = {kind}: allowed {', '.join(known())}")
     if kind not in _loaded:
@@ -290,10 +290,10 @@ def family_of(backend: Any) -> Family:
 
 
 def add(one: Family, what: str) -> None:
-    """Make a family known as `backend=KIND`.
+    """Register a family as `backend=KIND`.
 
-    Args: one: its KIND is the default of the field `kind` of its config. what: the sentence that the help shows.
-    Raises: ValueError for a kind that exists.
+    Args: one: the family; KIND is the default of `kind` in its config. what: the sentence that the help shows.
+    Raises: ValueError if the kind exists.
     """
     kind = one.config().kind
     presets.add(f"backend/{kind}", {"kind": kind}, what)

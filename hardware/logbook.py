@@ -1,4 +1,4 @@
-"""What one reactor has to report: rows for the journal, notes for the next receipt, its present fault."""
+"""Reports of one reactor: rows for the journal, notes for the next receipt, and its current fault."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -20,8 +20,9 @@ class Logbook:
     """One reactor's journal, notes and fault.
 
     Args: log: takes a row; must never raise (see `hardware.stations`). write: takes a row that must be on the disk
-      before what it speaks of is done, e.g. an intent; may raise. elapsed: run time, s.
-    Attributes: fault; news, whether its kind changed since someone last looked; notes for the next receipt.
+      before its action begins, e.g. an intent; may raise. elapsed: returns the run time, s.
+    Attributes: fault: current fault or None. news: the fault's kind has changed since the last measurement. notes:
+      notes for the next receipt.
     """
 
     def __init__(self, name: str, log: Log, write: Log, elapsed: Callable[[], float]) -> None:
@@ -35,7 +36,7 @@ class Logbook:
         self._log(kind, {"reactor": self.name, **fields})
 
     def write(self, kind: str, **fields: Any) -> None:
-        """Write a row first. Raises: what the journal raises; then nothing is to be done."""
+        """Write a row before its action. Raises: what the journal raises; then the action must not begin."""
         self._write(kind, {"reactor": self.name, **fields})
 
     def tell(self, note: Message) -> None:
@@ -44,12 +45,12 @@ class Logbook:
         self.log("note", note=str(note), **note.row)
 
     def say(self, note: Message) -> None:
-        """Write a note and show it at once: of a wait, which no receipt would tell of before it is over."""
+        """Write a note and show it at once, for a wait: a receipt would come only after the wait."""
         screen.info("%s: %s", self.name, note)
         self.log("note", note=str(note), **note.row)
 
     def report(self, fault: Fault | None) -> None:
-        """Set or clear the fault; a change of its kind is written."""
+        """Set or clear the fault; write a row if its kind changes."""
         before, self.fault = self.fault, fault
         if (before.kind if before else None) != (fault.kind if fault else None):
             self.news = True

@@ -1,4 +1,4 @@
-"""What a run remembers: declared once by each class, saved as plain numbers and lists, put back only where it fits."""
+"""Saved state of a run: each class declares it once; it is saved as numbers and lists, and checked when restored."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,14 +17,14 @@ KINDS: dict[str, tuple[set[type], str]] = {
 
 @runtime_checkable
 class Remembers(Protocol):
-    """Something with a memory, which a resumed run continues.
+    """An object whose state a resumed run restores.
 
-    Each key is an attribute, of that name or with an underscore before it: an array, a flag, a list of random streams,
-    or something that remembers. As it stands before its first use, an attribute says which type and shape a saved value
-    has, and where it may be None: in place of the nan or the infinity that stands there then.
+    Each key names an attribute, with or without a leading underscore: an array, a flag, a list of random streams, or
+    another such object. The attribute's value before its first use defines type and shape of a saved value; a saved
+    None is allowed only where that value is nan or infinite.
 
-    A class may have a method `resumed()`: called after everything was put back; sets what begins anew, or raises
-    ValueError for what cannot be.
+    A class may have a method `resumed()`, which is called after the restore: it resets what begins anew, or raises
+    ValueError for an impossible state.
     """
 
     @property
@@ -32,12 +32,12 @@ class Remembers(Protocol):
 
 
 def save(owner: Remembers) -> dict[str, Any]:
-    """Everything that `owner` remembers, as plain numbers and lists; None stands for what is not finite."""
+    """Return the state of `owner` as plain numbers and lists, with None for values that are not finite."""
     return {key: _plain(getattr(owner, _name(owner, key))) for key in owner.remembers}
 
 
 def restore(owner: Remembers, state: Any, path: str) -> None:
-    """Continue as saved under `path`; `owner` has not been used yet. Raises: ValueError naming what does not fit."""
+    """Restore `state` into an unused `owner`. Raises: ValueError, beginning with `path`, naming what does not fit."""
     if not isinstance(state, Mapping):
         raise ValueError(f"{path}: {str(state)[:40]}, expected keys and values")
     for key in owner.remembers:
@@ -54,17 +54,17 @@ def restore(owner: Remembers, state: Any, path: str) -> None:
 
 
 def row(owner: Remembers, n: int) -> dict[str, Any]:
-    """Return what `owner` remembers of reactor n, as `save`; an array is saved without its padding of inf."""
+    """Return the state of reactor n, as `save`; an array is saved without its padding of inf."""
     return {key: _plain(_unpadded(getattr(owner, _name(owner, key))[n])) for key in owner.remembers}
 
 
 def rows(owner: Remembers) -> list[dict[str, Any]]:
-    """Every reactor's `row`; none of something that remembers nothing."""
+    """Return the `row` of every reactor; an empty list if `owner` has no state."""
     return [row(owner, n) for n in range(_reactors(owner))]
 
 
 def restore_rows(owner: Remembers, state: Any, path: str) -> None:
-    """Continue as `rows` saved. Raises: ValueError as `restore`, whose text begins with `path`."""
+    """Restore the output of `rows`. Raises: as `restore`."""
     n = _reactors(owner)
     if n and not (isinstance(state, list) and len(state) == n):
         raise ValueError(f"{path}: {str(state)[:40]}, expected one entry for each of {n} reactors")

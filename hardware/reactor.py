@@ -1,4 +1,4 @@
-"""What the control loop needs of a set of reactors, whatever stands behind it: simulation, emulator or bench.
+"""Interface of the control loop to a set of reactors: a simulation, an emulator or the bench.
 
 All arrays have a leading axis of N reactors. A loop step is: `measure` (waits until at least one reactor has a new
 sample), decide for the rows that are `fresh`, `actuate` those rows. `stop` is idempotent and always allowed.
@@ -24,11 +24,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Vitals:
-    """State of a device beside the sample.
+    """State of a device, apart from the sample.
 
     age_s: time since the newest sample arrived, by this computer's monotonic clock, shape (N,).
     raw: spectrometer counts of the newest sample, shape (N,); nan is an invalid reading.
-    faults: what is wrong with each reactor, or None; N entries.
+    faults: the fault of each reactor, or None; N entries.
     blank: counts that read as OD 0 when that sample was taken, shape (N,); None where the device has none.
     """
 
@@ -61,13 +61,13 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Command:
-    """What to do with the reactors of `rows`.
+    """Commands to the reactors of `rows`.
 
     rows: True for the reactors to act on (the fresh ones), shape (N,).
     pump_rate: mean feed rate over the coming control period, mL/s, shape (N,), >= 0.
-    temperature: thermostat target, degC, shape (N,); nan leaves it as it is.
+    temperature: thermostat target, degC, shape (N,); nan leaves a target unchanged.
     pump: number of the pump that gives the dose, 1 (the feed), 3 or 4, shape (N,); None: the feed everywhere.
-    targets: of actuators of a family's own, by name, each (N,); nan leaves one as it is.
+    targets: commands to a family's own actuators, by name, each (N,); nan leaves a target unchanged.
     """
 
     rows: Mask
@@ -79,16 +79,16 @@ class Command:
 
 @dataclass(frozen=True)
 class Receipt:
-    """What was done.
+    """Volumes that a command, or a repetition of its dose, gave.
 
-    volume_ml: fresh medium asked of the pumps for this command, mL, shape (N,); 0 outside `rows`. It is what the
-      pump was really told: less than the command where a limit cut it or a small dose was put off to the next.
-    notes: what differs from the command, one line each.
-    waste_ml: what the waste pump was told to be able to remove, mL, shape (N,); None where waste is not modelled.
-    pump: number of the spare pump that gave it, of a repetition; 0 for the feed, and where the command says it.
-    kept_ml: by how much what is put off to the next dose has grown, mL, shape (N,), negative where that was given or
-      lost; None where nothing is put off.
-    low_ml: the least that volume_ml can have been, mL, shape (N,); None: exactly that.
+    volume_ml: fresh medium requested from the pumps, mL, shape (N,); 0 outside `rows`. It is less than commanded where
+      a limit cut the dose or a small dose is kept for the next.
+    notes: differences from the command, one line each.
+    waste_ml: volume that the waste pump can remove in its time, mL, shape (N,); None if waste is not modelled.
+    pump: number of the spare pump that gave a repetition; 0: the feed pump, or the pump of the command.
+    kept_ml: change of the volume that is kept for the next dose, mL, shape (N,), negative where it was given or lost;
+      None if no volume is kept.
+    low_ml: smallest volume that may have been given, mL, shape (N,); None: volume_ml.
     """
 
     volume_ml: Array
@@ -108,54 +108,54 @@ class Reactor(Protocol):
 
     @property
     def handed_over(self) -> Mask:
-        """Reactors that the device's own regulation has been given for good, shape (N,); by default none."""
+        """Reactors that were handed over to the device's own regulation, shape (N,); by default none."""
         return np.zeros(len(self.names), dtype=np.bool_)
 
     def measure(self) -> Measurement:
-        """Wait for a new sample of at least one reactor, or, when none comes in time, return with none fresh.
+        """Wait for a new sample of at least one reactor; if no sample comes in time, return without a fresh one.
 
-        Trouble with single reactors is told in `vitals`, so that the others go on.
-        Raises: ReactorError for what no waiting can mend.
+        Faults of single reactors are in `vitals`, so that the others continue.
+        Raises: ReactorError for an error that does not pass.
         """
 
     def actuate(self, command: Command) -> Receipt:
         """Carry out a command. Raises: as `measure`."""
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Return what was given beyond the receipts, or less where negative: run time, s, and volumes, in order."""
+        """Return volumes given beyond the receipts, negative if less was given, with run times, s, in order."""
         return []
 
     def elapsed(self) -> float:
-        """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
+        """Return the run time, s, on the monotonic clock of `Measurement.time_s`."""
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """All pumps that feed or empty `rows` off, verified; returns what failed, one line per reactor, name first."""
+        """Switch all feed and waste pumps of `rows` off, verified; return failures, a line per reactor, name first."""
 
     def give_up(self, rows: Mask) -> list[str]:
-        """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed, as `pumps_off`."""
+        """End all dosing of `rows` for this run, also by the device's regulation; return failures as `pumps_off`."""
         return self.pumps_off(rows)
 
     def heat_off(self, rows: Mask) -> list[str]:
-        """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
+        """Switch the heating of `rows` off for the rest of the run; return failures as `pumps_off`."""
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand `rows` over to the device's own regulation at `setpoint` (OD, (N,)); returns what failed."""
+        """Hand `rows` over to the device's own regulation at `setpoint` (OD, (N,)); return failures as `pumps_off`."""
 
     def stop(self) -> None:
-        """All pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
+        """Switch all pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
 
 
 @runtime_checkable
 class KeepsLevels(Protocol):
-    """Reactors that keep a ledger of their own, by which they refuse doses."""
+    """Reactors that keep their own ledger of the vials and refuse doses by it."""
 
     def set_level(self, n: int, level_ml: float) -> None:
-        """Put the ledger of reactor n to a volume, as soon as it answers."""
+        """Set the ledger of reactor n to a volume as soon as the reactor answers."""
 
 
 @contextmanager
 def left_off(reactors: Reactor) -> Iterator[None]:
-    """Leave all pumps off and verified where this context ends by an error or a stop. Raises: that; NotLeftOff."""
+    """Switch all pumps off, verified, if this context ends by an error or a stop. Raises: that error; NotLeftOff."""
     try:
         yield
     except BaseException as error:

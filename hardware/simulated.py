@@ -28,9 +28,9 @@ class SimulatedConfig:
 
 
 class SimulatedReactors(Reactor):
-    """`Reactor` in front of a plant: a cycle is sample, decide, dose, grow for the rest of the control period.
+    """`Reactor` of a simulated plant: a cycle is sample, decide, dose, grow for the rest of the control period.
 
-    Args: plant: N vials, reset to the state the run starts from. control_min: between samples, min.
+    Args: plant: N vials, reset to the state at the start of the run. control_min: control period, min.
     """
 
     def __init__(self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0) -> None:
@@ -72,12 +72,12 @@ class SimulatedReactors(Reactor):
         return 60.0 * self._minutes
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """No dose is pending for `rows` any more. Nothing can fail."""
+        """Cancel the pending doses of `rows`; this never fails."""
         self._feed_s = np.where(rows, 0.0, self._feed_s)
         return []
 
     def heat_off(self, rows: Mask) -> list[str]:
-        """Switch the heater of `rows` off until a temperature is commanded. Nothing can fail."""
+        """Switch the heater of `rows` off until a temperature is commanded; this never fails."""
         self._target = np.where(rows, 0.0, self._target)
         return []
 

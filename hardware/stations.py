@@ -1,6 +1,6 @@
-"""Reactors that are commanded one by one: measure, dose, switch off, with rows and receipts, for every family.
+"""Reactors that are commanded one by one: measuring, dosing and stopping, as all families with a device share them.
 
-A family gives a `Station` per reactor and says in a subclass what it does between two of them and while it waits.
+A family gives a `Station` per reactor, and a subclass of `Stations` with its work between two stations and in a wait.
 """
 
 import math
@@ -17,15 +17,15 @@ from hardware.messages import PumpsNotOff
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
 from hardware.storage.history import History
 
-AGAIN_S = 20.0  # from one `measure` without a sample to the next, while there is none
+AGAIN_S = 20.0  # between two returns of `measure` while no samples come
 
 
 class Newest:
     """The newest sample of one reactor; nan where there is none.
 
-    Attributes: at, when it was taken, clock time, s; od; temperature, degC; raw, blank, counts, blank None where the
-      device has none; fluorescence, counts, None where it is not measured; arrived_s, clock time from which its age
-      counts; next_look, clock time at which the reactor is to be looked at again.
+    Attributes: at: clock time at which it was taken, s. od. temperature: degC. raw, blank: counts; blank is None if the
+      device has none. fluorescence: counts, None if it is not measured. arrived_s: clock time from which its age
+      counts. next_look: clock time of the next look at the reactor.
     """
 
     def __init__(self, now: float) -> None:
@@ -37,7 +37,7 @@ class Newest:
 
 @dataclass(frozen=True)
 class Plan:
-    """A dose, mL; carry_ml: asked but put off to the next, because it is less than the pump can deliver."""
+    """A planned dose, mL. carry_ml: requested volume kept for the next dose, as the pump cannot deliver so little."""
 
     feed_ml: float = 0.0
     waste_ml: float = 0.0
@@ -45,11 +45,11 @@ class Plan:
 
 
 class Station(Protocol):
-    """One reactor. What switches something off or over may return a course, which the family goes through.
+    """One reactor. A method that switches off or hands over may return a generator, whose steps the family then runs.
 
-    Attributes: doses, with carry_ml, put off to the next, and extra, what was given beyond what was booked when doses
-      began; sampling, its newest sample; regulated_od, OD at which it was handed over to the device's own regulation,
-      nan while this program controls.
+    Attributes: doses: has carry_ml, volume kept for the next dose, and extra, volumes given beyond those booked when
+      doses began. sampling: the newest sample. regulated_od: OD at which the reactor was handed over to the device's
+      own regulation, nan while this program controls.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Station(Protocol):
 
     @property
     def handed_over(self) -> bool:
-        """Whether the device regulates it for good."""
+        """Whether the device's own regulation controls the reactor for the rest of the run."""
         return math.isfinite(self.regulated_od)
 
     def poll(self) -> bool: ...
@@ -88,9 +88,9 @@ class Stations(Generic[S, H]):
     Use: `begin` (or `begin(replay(rows), elapsed_s)` after a crash), then `measure` and `actuate` in turn, `stop` in
     any case.
 
-    Args: clock: of the run. stale_s: after which without a sample `measure` returns. log: takes samples, intents,
-      doses, commands, faults and notes, e.g. `Journal.append`. What must be on the disk before it is done is written
-      first, so a log that raises there prevents it; elsewhere its error is kept, and raised by `raise_late`.
+    Args: clock: the run's clock. stale_s: time without a sample after which `measure` returns, s. log: takes samples,
+      intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written before its dose, so an
+      error of the log prevents the dose; any other error of the log is kept, and raised by `raise_late`.
     """
 
     stations: Sequence[S]
@@ -111,27 +111,26 @@ class Stations(Generic[S, H]):
         return self._clock.now() - self._zero
 
     def begin(self, histories: Mapping[str, H] | None = None, elapsed_s: float = 0.0) -> None:
-        """Bring every reactor into its running state; if that fails or is stopped, switch all pumps off, or report it.
+        """Start every reactor; if this fails or is stopped, switch all pumps off, or report those that may be on.
 
-        Args: histories: `replay` of the journal of the run that is resumed. elapsed_s: run time that has passed since
-          that run began.
-        Raises: ReactorError for a reactor that cannot be brought there; of a run that is resumed only if none can: the
-          others do not wait for a failed one, which is reported and tried again.
+        Args: histories: `replay` of the resumed run's journal. elapsed_s: run time since the run began, s.
+        Raises: ReactorError if a reactor cannot be started. A resumed run raises it only if no reactor can be started:
+          it reports a failed reactor and tries it again.
         """
         self._zero = self._clock.now() - elapsed_s
         with left_off(self):
             self._take_over(histories or {})
 
     def _take_over(self, histories: Mapping[str, H]) -> None:
-        """Restore every reactor, then bring it into its running state. Raises: as `begin`."""
+        """Restore every reactor, then start it. Raises: as `begin`."""
         raise NotImplementedError
 
     def measure(self) -> Measurement:
-        """Return the newest samples; wait for one, doing what is due meanwhile.
+        """Wait for a new sample, run the tasks that are due meanwhile, and return the newest samples.
 
-        Returns with none fresh when a fault appears or disappears, and when no reactor has had a sample for `stale_s`
-        (again every 20 s while that lasts): `vitals` then says what is wrong.
-        Raises: what the log raised; nothing for trouble with device or link.
+        Returns without a fresh sample if a fault appears or disappears, or if no reactor had a sample for `stale_s`
+        (then every 20 s); the faults are in `vitals`.
+        Raises: what the log raised; nothing for errors of device or link.
         """
         last = max(station.sampling.arrived_s for station in self.stations)
         deadline = max(last + self._stale_s, self._clock.now() + AGAIN_S)
@@ -170,10 +169,10 @@ class Stations(Generic[S, H]):
         return Measurement(time_s, column("od"), column("temperature"), fresh, vitals, light)
 
     def actuate(self, command: Command) -> Receipt:
-        """Begin one dose per row of `command.rows`, targets first; its end is carried out by `measure`.
+        """Set the targets of `command.rows` and begin one dose for each row; `measure` ends the doses.
 
         Raises: what the log raises when an intent cannot be written (then nothing is dosed); ValueError for a rate
-          that is negative or not finite. Trouble with device or link becomes a note.
+          that is negative or not finite. An error of device or link becomes a note.
         """
         volume, waste, kept = (np.zeros(len(self.stations)) for _ in range(3))
         for i, station in enumerate(self.stations):
@@ -202,7 +201,7 @@ class Stations(Generic[S, H]):
         return sorted(found, key=lambda one: one[0])
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """All pumps of `rows` that a run switches, off, verified; returns what failed, one line per reactor."""
+        """Switch off, verified, all pumps of `rows` that a run switches; return the failures, one line per reactor."""
         return self._each(rows, lambda station: station.pumps_off())
 
     def give_up(self, rows: Mask) -> list[str]:
@@ -212,7 +211,7 @@ class Stations(Generic[S, H]):
         return self._each(rows, lambda station: station.heat_off())
 
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
-        """Hand `rows` over to the device's own regulation at `setpoint`, OD, (N,), for good; returns what failed."""
+        """Hand `rows` over to the device's own regulation at `setpoint`, OD, (N,); return the failures."""
         targets = dict(zip(self.names, setpoint, strict=True))
         return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
 
@@ -233,18 +232,18 @@ class Stations(Generic[S, H]):
         return failed
 
     def stop(self) -> None:
-        """All pumps off, verified, but those of a reactor that was handed over. Idempotent. Raises: PumpsNotOff."""
+        """Switch all pumps off, verified, except in reactors that were handed over. Idempotent. Raises: PumpsNotOff."""
         failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
         self.note_down("stop", {"reactors": self.names, "not_verified": failed})
         if failed:
             raise PumpsNotOff(failed="; ".join(failed))
 
     def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
-        """All pumps of these off for good; what could not be verified."""
+        """Switch all pumps of `stations` off; return the errors of those that failed."""
         raise NotImplementedError
 
     def raise_late(self) -> None:
-        """Raise what the log raised where it must not stand in the way of a pump-off; once."""
+        """Raise, once, the error of the log that `note_down` kept."""
         error, self._log_error = self._log_error, None
         if error is not None:
             raise error
@@ -254,7 +253,7 @@ class Stations(Generic[S, H]):
         self._log(kind, {"time_s": round(self.elapsed(), 3), **fields})
 
     def note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Write a row without ever standing in the way of a pump-off."""
+        """Write a row; keep an error of the log for `raise_late`, so that it never prevents a pump-off."""
         try:
             Stations.write(self, kind, fields)
         except (OSError, ReactorError) as error:

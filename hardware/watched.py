@@ -11,19 +11,19 @@ from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
 
-LASTING = 3  # samples in a row: a single odd reading withholds no dose here
+LASTING = 3  # samples in a row until a fault is reported
 
 
 @dataclass(frozen=True)
 class WatchedSafety(SafetyConfig):
-    """Limits beside a device that the interlock cannot stop."""
+    """Limits for a device that the interlock cannot stop: no response is more severe than HOLD."""
 
     def response(self, fault: Fault | type[Fault]) -> Response:
         return min(super().response(fault), Response.HOLD)
 
 
 class WatchedInterlock(Interlock):
-    """Interlock of a device that is only read: reports faults that last, expects no doses. Args: as of `Interlock`."""
+    """Interlock of a device that is only read: reports faults that last, expects no doses. Args: as in `Interlock`."""
 
     def __init__(self, n: int, config: SafetyConfig, *args: Any) -> None:
         super().__init__(n, WatchedSafety(**{f.name: getattr(config, f.name) for f in fields(config)}), *args)
@@ -43,7 +43,7 @@ class WatchedInterlock(Interlock):
 
 
 class Watched(Reactor):
-    """N reactors that another program regulates. Doses that were seen are returned by `repeated`."""
+    """N reactors that another program regulates; `repeated` returns the doses that were seen."""
 
     names: tuple[str, ...] = ()
 
@@ -51,7 +51,7 @@ class Watched(Reactor):
         self.names, self._seen = tuple(names), list[tuple[float, Receipt]]()
 
     def seen(self, at_s: float, volume_ml: Array) -> None:
-        """Book doses that were seen, mL, (N,), at a run time, s."""
+        """Book the volumes of doses that were seen, mL, (N,), at the run time `at_s`."""
         if (volume_ml != 0.0).any():
             self._seen.append((at_s, Receipt(volume_ml)))
 

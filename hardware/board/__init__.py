@@ -1,3 +1,3 @@
-"""What runs on the device's own board: one file, Python 3.7, standard library only.
+"""Software for the device's own board: one file, Python 3.7, standard library only.
 
-Imported by nobody but tests; the serial link speaks its frames."""
+Only tests import it; the serial link uses its frames."""

@@ -1,6 +1,6 @@
-"""Board agent: carries requests from a serial line to the Chi.Bio server, and is the dead-man switch of the pumps.
+"""Board agent: carries requests by serial line or HTTP to the Chi.Bio server, and is the pumps' dead-man switch.
 
-One file, Python 3.7 standard library only: it is copied to the BeagleBone as it is (installation: docs/board_agent.md).
+One file with the standard library of Python 3.7, copied to the BeagleBone unchanged (docs/board_agent.md).
 
 Frames (protocol 2, ASCII, one request at a time on the line)
 -------------------------------------------------------------
@@ -10,7 +10,7 @@ Request, PC to board, one line of at most 512 bytes including the newline:
 
   ID      decimal, 1 to 4294967295, no sign, no leading zero. 0 is reserved for replies to unreadable requests. The
           upper 16 bits name the client's session, the lower 16 count its requests and start again at 0.
-  METHOD  GET or POST (carried to the device), RAW (GET, the answer not reduced), HELLO, PING or BYE (the agent's own).
+  METHOD  GET or POST (carried to the device), RAW (GET without reduction of the answer), HELLO, PING, BYE (agent).
   PATH    starts with "/", printable ASCII without space and without ">". "/" for HELLO, PING and BYE.
   CRC     8 lower-case hexadecimal digits: zlib.crc32 of the line from ">" up to, not including, the space before CRC.
 
@@ -18,8 +18,8 @@ Reply, board to PC, a header line, LENGTH bytes of body and one newline:
 
     <ID STATUS LENGTH CRC\\nBODY\\n
 
-  ID      the request's; 0 if the request could not be read.
-  STATUS  decimal. 100 to 599: the device's own HTTP status (HELLO, PING, BYE: 200). Under 100: the agent's,
+  ID      ID of the request; 0 if the request could not be read.
+  STATUS  decimal. 100 to 599: the device's own HTTP status (HELLO, PING, BYE: 200). Under 100: the agent's own status,
             10  the device refused the connection: the request was not carried out;
             11  the device was reached but no complete answer came: it may have acted;
             12  the answer was longer than 262144 bytes;
@@ -30,30 +30,30 @@ Reply, board to PC, a header line, LENGTH bytes of body and one newline:
   BODY    the device's body; a line of text for status under 100; JSON for HELLO, PING, BYE.
 
 Both sides ignore bytes that belong to no frame: the agent looks for the last ">" of a line, the PC for a line that
-starts with "<". Replies of earlier requests may still arrive after a time-out: the PC drops a reply whose ID is not
-the one it waits for (ID 0 counts as the answer to the request in flight).
+starts with "<". The reply to an earlier request may arrive after its time-out: the PC drops every reply whose ID is not
+that of the current request (ID 0 counts as a reply to the current request).
 
-Repeating a request is safe: a request equal to the previous one (same ID, METHOD, PATH) is answered from memory and
-not carried out again. So a PC that got no reply, a damaged one or ID 0 sends the very same line again; it takes a new
-ID for every new request and starts with HELLO. HELLO and a trip of the dead-man switch clear that memory.
+Repeating a request is safe: the agent answers a request equal to the previous one (same ID, METHOD, PATH) from memory
+and does not carry it out again. A PC that got no reply, a damaged reply or ID 0 therefore sends the same line again. It
+takes a new ID for every new request and starts with HELLO. HELLO and a trip of the dead-man switch clear the memory.
 
 HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 2, "version": "2.1", "deadman_s": 120.0, "silent_s":
 0.0, "armed": true, "trips": 0, "last_trip": "", "switched_off": {"M0": {"Pump1": 12.5}}, "url":
-"http://192.168.7.2:5000"}; silent_s is the silence before this request, switched_off how many seconds ago the dead-man
-switch last found a pump on and took its off.
+"http://192.168.7.2:5000"}. silent_s is the silence before this request; switched_off says how many seconds ago the
+dead-man switch last found a pump on and switched it off.
 
-GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the same JSON with fewer keys; `record`
-lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
-differ for an instant while the device appends; "Terminal.text" is cut to its newest 80 characters. RAW gives it whole.
+The agent reduces the answer to GET /getSysdata/ to the fields that a client needs (under 1 KB): the same JSON with
+fewer keys. `record` lists have only their last value; "_records" {"time": n, "OD": n, "ThermometerIR": n} has their
+lengths, which differ for an instant while the device appends. "Terminal.text" has its newest 80 characters.
 
-Dead man, one client, HTTP
---------------------------
-What the switch does, who is in charge and what is refused: docs/board_agent.md. A client is named by the line it comes
-on and its session, so one that was killed and starts again under the same session goes on at once.
+Dead-man switch, one client, HTTP
+---------------------------------
+docs/board_agent.md says what the switch does, which client is in charge and what is refused. The agent identifies a
+client by its line and session, so a killed client that starts again with the same session continues at once.
 
 `--http ADDRESS:PORT` carries HTTP requests to the device. A request needs a Host that is this board, no Origin,
 Authorization: Bearer TOKEN (--token-file), and may name its session, X-Session: 0 to 65535. No route of the device
-takes a body, so a POST says Content-Length: 0. The agent's own routes: GET /_agent/status (the JSON of HELLO; no
+takes a body, so a POST needs Content-Length: 0. The agent's own routes: GET /_agent/status (the JSON of HELLO; no
 heartbeat, from any session), POST /_agent/heartbeat (204) for a client that talks to the device directly, and POST
 /_agent/bye (204). 502: the device refused the connection; 504: no usable answer came.
 """
@@ -94,10 +94,10 @@ AGENT_METHODS = ("HELLO", "PING", "BYE")
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 PROBE_TIMEOUT_S = 40.0  # longer than the 30 s after which the device's server kills a hung worker
 RETRY_S = (2.0, 60.0)  # first and longest pause between passes of the dead-man switch that were not verified
-WRITE_TIMEOUT_S = 5.0  # without a byte leaving
+WRITE_TIMEOUT_S = 5.0  # without a byte sent
 BACKOFF_S = (0.2, 5.0)  # first and longest pause before the line is opened again
-HEAD_S, MAX_HEAD, MAX_FIELDS = 5.0, 8192, 64  # of an HTTP request: time to send its head, bytes and fields of it
-CONNECTIONS = 32  # at a time that have not shown the token
+HEAD_S, MAX_HEAD, MAX_FIELDS = 5.0, 8192, 64  # most of an HTTP request's head: time to send it, bytes, fields
+CONNECTIONS = 32  # most connections at a time without the token
 
 log = logging.getLogger("board_agent")
 
@@ -106,7 +106,7 @@ log = logging.getLogger("board_agent")
 
 
 def decode_request(line: bytes) -> tuple[int, str, str] | None:
-    """(ID, METHOD, PATH) of a line without its newline; None if it is not a valid request. Never raises."""
+    """Decode (ID, METHOD, PATH) of a line without its newline; None if it is not a valid request. Never raises."""
     start = line.rfind(b">")
     parts = line[start:].split(b" ") if start >= 0 and len(line) - start < MAX_LINE else []
     if len(parts) != 4 or parts[3] != b"%08x" % zlib.crc32(b" ".join(parts[:3])):
@@ -122,7 +122,7 @@ def decode_request(line: bytes) -> tuple[int, str, str] | None:
 
 
 def encode_reply(number: int, status: int, body: bytes) -> bytes:
-    """Header line, body and closing newline."""
+    """Encode header line, body and closing newline."""
     head = b"<%d %d %d" % (number, status, len(body))
     return head + b" %08x\n" % zlib.crc32(head + body) + body + b"\n"
 
@@ -177,11 +177,11 @@ class Failure(Exception):
 
 
 class Unanswered(Failure):
-    """The device gave no answer; `status` says how far the request got."""
+    """The device gave no answer; `status` tells whether it may have received the request."""
 
 
 def hang_up(line: socket.socket) -> None:
-    """End both directions; who waits on it wakes up."""
+    """Shut a connection down in both directions; a thread that waits on it wakes up."""
     with contextlib.suppress(OSError):
         line.shutdown(socket.SHUT_RDWR)
 
@@ -189,7 +189,7 @@ def hang_up(line: socket.socket) -> None:
 class Device:
     """The device's HTTP server.
 
-    Args: url: e.g. http://192.168.7.2:5000; timeout_s: longest wait for an answer.
+    Args: url: e.g. http://192.168.7.2:5000. timeout_s: longest wait for an answer, s.
     Raises: ValueError for an address that is not http://HOST[:PORT].
     """
 
@@ -201,7 +201,7 @@ class Device:
         self._host, self._port = parts.hostname, parts.port or 80
 
     def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
-        """(status, body, content type); the whole answer within the time-out. Raises: Unanswered."""
+        """Return (status, body, content type) of an answer within the time-out. Raises: Unanswered."""
         wait_s = timeout_s or self.timeout_s
         deadline = time.monotonic() + wait_s
         connection = http.client.HTTPConnection(self._host, self._port, timeout=wait_s)
@@ -209,7 +209,7 @@ class Device:
             connection.connect()
         except OSError as problem:
             raise Unanswered(REFUSED, f"{self.url}: {problem}") from problem
-        late = threading.Timer(wait_s, hang_up, [connection.sock])  # a device that dribbles must not hold the agent
+        late = threading.Timer(wait_s, hang_up, [connection.sock])  # a slow device must not hold the agent
         late.daemon = True
         late.start()
         try:
@@ -234,10 +234,10 @@ class Device:
 
 
 class BoardAgent:
-    """Carries the requests of one client to the device and turns the pumps off when they stop coming.
+    """Carrier of one client's requests to the device; it switches the pumps off when no request comes.
 
-    Args: device; deadman_s: allowed silence; probe: end a pass with a request that unmasks a dead bus.
-    `lock` is held for every request and for the whole of one reactor's pass.
+    Args: device. deadman_s: allowed silence, s. probe: end a pass with a request that fails on a dead bus.
+    `lock` is held for every request and for the whole pass of one reactor.
     """
 
     def __init__(self, device: Device, deadman_s: float, probe: bool = True) -> None:
@@ -245,12 +245,12 @@ class BoardAgent:
         self.lock = threading.RLock()
         self.armed, self.session, self.trips, self.last_trip = True, False, 0, ""
         self.silent_s = 0.0  # silence before the latest request
-        self._switched_off: dict[str, dict[str, float]] = {}  # reactor, pump: when it was last found on and stopped
+        self._switched_off: dict[str, dict[str, float]] = {}  # reactor, pump: time when last found on and stopped
         self._beat = time.monotonic()
         self._beats = 0
-        self._settled = False  # this silence has been dealt with
+        self._settled = False  # the pumps were verified off in this silence
         self._master: tuple[str, int] | None = None  # line and session of the client in charge
-        self._door = threading.Lock()  # held while it is decided who that is
+        self._door = threading.Lock()  # held while the client in charge is decided
         self._memory: tuple[tuple[int, str, str], bytes] | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -259,16 +259,16 @@ class BoardAgent:
         self._thread.start()
 
     def claim(self, line: str, session: int, arm: bool = True) -> str:
-        """Accept a sign of life of the client in charge and return ""; for any other client return why it is refused.
+        """Note a request of the client in charge and return ""; for any other client return the reason of the refusal.
 
-        Args: line, session: who asks. arm: False ends the watch until the next one, and whoever comes is in charge.
+        Args: line, session: the client. arm: False ends the watch until the next request, whose client is in charge.
         """
         with self._door:
             now = time.monotonic()
             if self._master not in (None, (line, session)):
                 return (
-                    f"another client is in charge (on {self._master[0]}, heard {now - self._beat:.0f} s ago): not "
-                    f"carried out; end it, or wait for {self.deadman_s:g} s of its silence, which switch its pumps off"
+                    f"another client is in charge (on {self._master[0]}, {now - self._beat:.0f} s ago): not carried "
+                    f"out; end it, or wait for {self.deadman_s:g} s of its silence, after which its pumps go off"
                 )
             self.silent_s, self._beat = now - self._beat, now
             self._beats += 1
@@ -326,7 +326,7 @@ class BoardAgent:
                 self._trip()
 
     def _trip(self) -> None:
-        """No client: passes until everything is verified off or somebody is back."""
+        """Repeat passes until all pumps are verified off or a client is back."""
         beats = self._beats
         self.trips += 1
         self.last_trip = time.strftime("%Y-%m-%dT%H:%M:%S")
@@ -347,7 +347,7 @@ class BoardAgent:
             pause = min(2.0 * pause, RETRY_S[1])
 
     def sweep(self, beats: int) -> list[str]:
-        """One pass over all present reactors; what could not be verified. Ends early when `beats` is outdated."""
+        """Switch off all present reactors once; return what was not verified. Ends early if a client is back."""
         problems = []
         try:
             with self.lock:
@@ -356,7 +356,7 @@ class BoardAgent:
                 if present[name] == 1 and self._beats == beats:
                     with self.lock:
                         problems += self._switch_off(name)
-        except Exception as problem:  # whatever a device answers, the watch goes on
+        except Exception as problem:  # the watch continues, whatever a device answers
             problems.append(f"{type(problem).__name__}: {str(problem)[:200]}")
         return problems
 
@@ -372,7 +372,7 @@ class BoardAgent:
         if state["UIDevice"] != name or state["presentDevices"][name] != 1:
             return [name + " cannot be selected"]
         if state["OD"]["ON"] == 1:
-            log.warning("%s regulates on its own (OD.ON = 1): left alone", name)
+            log.warning("%s: pumps left on, because the device regulates the OD (OD.ON = 1)", name)
             return []
         for pump in PUMPS:
             status, _, _ = self.device.request("POST", f"/SetOutputOn/{pump}/0/{name}")
@@ -380,7 +380,10 @@ class BoardAgent:
                 return [f"{pump} of {name}: status {status}"]
             if state[pump]["ON"] != 0:
                 mine = {**self._switched_off.get(name, {}), pump: time.monotonic()}
-                self._switched_off = {**self._switched_off, name: mine}  # anew: another thread may be reading it
+                self._switched_off = {
+                    **self._switched_off,
+                    name: mine,
+                }  # a new dict, for another thread that reads
         state = self._state()
         running = [pump for pump in PUMPS if state[pump]["ON"] != 0]
         if state["UIDevice"] != name or running:
@@ -390,7 +393,7 @@ class BoardAgent:
         return []
 
     def stop(self) -> None:
-        """End the watch; a live session's pumps are switched off first."""
+        """End the watch; in an open session, switch the pumps off."""
         self._stop.set()
         if self.session and not self._settled:
             problems = self.sweep(self._beats)
@@ -401,10 +404,10 @@ class BoardAgent:
 
 
 class SerialPort:
-    """Owns a tty in raw mode and answers the requests that arrive on it; a line that hangs up is opened again.
+    """A tty in raw mode, and the answers to its requests; a line that hangs up is opened again.
 
-    Args: path: e.g. /dev/ttyGS0; baud: rate, without meaning on USB; agent.
-    Raises: ValueError for a rate the system does not know.
+    Args: path: e.g. /dev/ttyGS0. baud: line rate, without effect on USB. agent.
+    Raises: ValueError for a rate that the system does not have.
     """
 
     def __init__(self, path: str, baud: int, agent: BoardAgent) -> None:
@@ -466,14 +469,14 @@ class SerialPort:
             if not chunk:
                 raise OSError(errno.EIO, "hung up")
             *lines, waiting = (waiting + chunk).split(b"\n")
-            waiting = waiting[-2 * MAX_LINE :]  # garbage without end is not kept; its newline makes one bad line
+            waiting = waiting[-2 * MAX_LINE :]  # endless garbage is cut; it makes one bad line
             for line in lines:
                 reply = self._agent.answer_line(line)
                 if reply:
                     self._write(descriptor, reply)
 
     def _write(self, descriptor: int, data: bytes) -> None:
-        """Send, or give up when nobody reads: a full line must not stop the agent."""
+        """Send a reply; drop it if nobody reads, because a full line must not stop the agent."""
         while data:
             if not select.select([], [descriptor], [], WRITE_TIMEOUT_S)[1]:
                 termios.tcflush(descriptor, termios.TCOFLUSH)
@@ -489,7 +492,7 @@ class SerialPort:
 
 
 class Refusal(Failure):
-    """A request that is not carried out; `status` is that of HTTP, the message one line for the client."""
+    """A request that is not carried out; `status` is the HTTP status, the message a line for the client."""
 
 
 REASONS = {
@@ -505,7 +508,7 @@ OWN_POSTS = ("/_agent/heartbeat", "/_agent/bye")
 def parse_head(head: bytes) -> tuple[str, str, dict[str, str]]:
     """Parse METHOD, PATH and fields (names in lower case) of an HTTP request's head, without the empty line after it.
 
-    Raises: Refusal for what is not one GET or POST without a body, and for a field that comes twice.
+    Raises: Refusal unless it is one GET or POST without a body and without a repeated field.
     """
     first, *lines = head.split(b"\r\n")
     request = REQUEST.fullmatch(first)
@@ -534,7 +537,7 @@ def parse_head(head: bytes) -> tuple[str, str, dict[str, str]]:
 
 
 def read_token(path: str | None) -> bytes:
-    """Read the token from a file. Raises: ValueError for one that is missing, open to others or too short."""
+    """Read the token from a file. Raises: ValueError if it is missing, readable by others or too short."""
     if not path:
         raise ValueError("http without token-file: give --token-file FILE (docs/board_agent.md, The token)")
     try:
@@ -552,9 +555,9 @@ def read_token(path: str | None) -> bytes:
 
 
 class Proxy(socketserver.ThreadingTCPServer):
-    """The agent beside an HTTP link; see the module's docstring.
+    """HTTP server of the agent; see the module's docstring.
 
-    Args: address: where to listen; agent; token: what a client must know; names: under which it may be asked for.
+    Args: address: where to listen. agent. token: secret of its clients. names: names of this board that Host may have.
     """
 
     daemon_threads = True
@@ -564,12 +567,12 @@ class Proxy(socketserver.ThreadingTCPServer):
     def __init__(self, address: tuple[str, int], agent: BoardAgent, token: bytes, names: Iterable[str]) -> None:
         self.agent, self.token = agent, token
         self.names = {"localhost", "127.0.0.1", address[0].lower(), *(name.lower() for name in names)}
-        self._strangers: dict[socket.socket, None] = {}  # who has not shown the token yet, the oldest first
+        self._strangers: dict[socket.socket, None] = {}  # connections without the token, oldest first
         self._list = threading.Lock()
         super().__init__(address, ProxyHandler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """In a thread of its own; where too many wait to be let in, the oldest has to go."""
+        """Process a request in a new thread; if too many lack the token, close the oldest connection."""
         with self._list:
             if len(self._strangers) >= CONNECTIONS:
                 oldest = next(iter(self._strangers))
@@ -585,13 +588,13 @@ class Proxy(socketserver.ThreadingTCPServer):
             self.let_in(request)
 
     def let_in(self, request: socket.socket) -> None:
-        """Release a request that has shown the token, or is gone. Idempotent."""
+        """Stop counting a connection that has shown the token, or has ended. Idempotent."""
         with self._list:
             self._strangers.pop(request, None)
 
 
 def encode_answer(status: int, body: bytes, kind: str) -> bytes:
-    """Encode an HTTP answer. No header opens it to a page of another origin."""
+    """Encode an HTTP answer, without a header that would permit web pages of other origins."""
     lines = [f"HTTP/1.1 {status} {REASONS.get(status, 'OK')}", f"Server: board_agent/{VERSION}", "Connection: close"]
     lines += [f"Content-Type: {kind}", "X-Content-Type-Options: nosniff", "Cache-Control: no-store"]
     lines += [f"Content-Length: {len(body)}"] * (status not in (204, 304))
@@ -612,12 +615,12 @@ class ProxyHandler(socketserver.BaseRequestHandler):
             self.request.sendall(encode_answer(*answer))
             self.request.shutdown(socket.SHUT_WR)
             self.request.settimeout(0.2)
-            deadline = time.monotonic() + 1.0  # a refused body is taken off the line, or a reset overtakes the answer
+            deadline = time.monotonic() + 1.0  # read a refused body, else a reset would overtake the answer
             while self.request.recv(65536) and time.monotonic() < deadline:
                 pass
 
     def _head(self) -> bytes:
-        """Up to the empty line. Raises: Refusal if it does not come in time or is too long."""
+        """Read the head, up to the empty line. Raises: Refusal if it does not come in time or is too long."""
         deadline, data = time.monotonic() + HEAD_S, b""
         while b"\r\n\r\n" not in data:
             left = deadline - time.monotonic()
@@ -657,11 +660,9 @@ class ProxyHandler(socketserver.BaseRequestHandler):
         """Admit a client and return its session. Raises: Refusal for a web page and for a client without the token."""
         host = re.sub(r":[0-9]{1,5}$", "", fields.get("host", "")).lower()
         if host not in self.server.names and host != self.request.getsockname()[0]:
-            raise Refusal(
-                403, f"Host {host[:80]!r} is not this agent: ask for its address, or start it with --host NAME"
-            )
+            raise Refusal(403, f"Host {host[:80]!r} is not this agent: use its address, or start it with --host NAME")
         if "origin" in fields:
-            raise Refusal(403, "a request of a web page (it has an Origin): refused; only programs may ask")
+            raise Refusal(403, "a request of a web page (it has an Origin) is refused; use a program")
         given = fields.get("authorization", "").encode("latin-1")
         if not hmac.compare_digest(given, b"Bearer " + self.server.token):
             raise Refusal(
@@ -683,17 +684,17 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--tty", help="serial line to serve, e.g. /dev/ttyGS0")
     p.add_argument("--baud", type=int, default=115200, help="line rate (default %(default)s)")
     p.add_argument("--http", metavar="ADDRESS:PORT", help="listen here for HTTP requests, e.g. 192.168.7.2:5001")
-    p.add_argument("--token-file", metavar="FILE", help="what an HTTP client must know, mode 600 (needed by --http)")
-    p.add_argument("--host", action="append", default=[], metavar="NAME", help="a name of this board, beside ADDRESS")
+    p.add_argument("--token-file", metavar="FILE", help="secret of HTTP clients, mode 600 (needed by --http)")
+    p.add_argument("--host", action="append", default=[], metavar="NAME", help="a further name of this board")
     p.add_argument("--url", default="http://192.168.7.2:5000", help="the device's server (default %(default)s)")
     p.add_argument("--deadman", type=float, default=120.0, help="allowed silence, s (default %(default)s)")
     p.add_argument("--http-timeout", type=float, default=18.0, help="wait for the device, s (default %(default)s)")
-    p.add_argument("--no-probe", action="store_true", help="do not unmask a dead bus with MeasureTemp")
+    p.add_argument("--no-probe", action="store_true", help="do not test the bus with MeasureTemp")
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until SIGTERM or SIGINT; exit status."""
+    """Run until SIGTERM or SIGINT; return the exit status."""
     arguments = parser().parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     proxy = None

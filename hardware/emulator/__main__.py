@@ -1,4 +1,4 @@
-"""`python -m hardware.emulator`: an emulated Chi.Bio as a process of its own."""
+"""`python -m hardware.emulator`: an emulated Chi.Bio as a separate process."""
 
 import sys
 

@@ -17,7 +17,7 @@ from hardware.emulator.faults import Switches
 Steps = Generator[float, None, None]
 
 EPOCH = 1_767_225_600.0  # the board's clock at device second 0: 2026-01-01 00:00:00
-HARDWARE = -1  # life of what goes on without the software
+HARDWARE = -1  # `life` of events that continue without the software
 
 
 class AppError(Exception):
@@ -33,17 +33,17 @@ class ProcessDied(Exception):
 
 
 class Due(NamedTuple):
-    """A generator that is due. `life` is the software process it belongs to, or HARDWARE; `owner` names it."""
+    """The next step of a generator. `life`: number of its software process, or HARDWARE. `owner`: its name."""
 
     at: float
-    order: int  # of equal times the earlier scheduled comes first; unique, so nothing further is compared
+    order: int  # unique; at equal times the event that was scheduled first comes first
     steps: Steps
     life: int
     owner: str
 
 
 class EventQueue:
-    """Events in the order of device time. `now` is the time of the event in progress, `life` the present process."""
+    """Events in the order of device time. `now`: time of the current event. `life`: number of the current process."""
 
     def __init__(self, now: float) -> None:
         self.now, self.life = now, 0
@@ -55,11 +55,11 @@ class EventQueue:
         heapq.heappush(self._events, Due(self.now + delay, self._order, steps, life, owner))
 
     def next_time(self) -> float:
-        """When the next event is due, device s; inf if none."""
+        """Return when the next event is due, device s; inf if there is none."""
         return self._events[0].at if self._events else math.inf
 
     def due(self, t: float) -> Iterator[Due]:
-        """Every event up to device time `t`, in order; those of earlier processes are dropped."""
+        """Yield every event up to device time `t`, in order; drop those of earlier processes."""
         while self._events and self._events[0].at <= t:
             event = heapq.heappop(self._events)
             if event.life in (HARDWARE, self.life):
@@ -68,15 +68,15 @@ class EventQueue:
         self.now = max(self.now, t)
 
     def remove(self, owner: str) -> None:
-        """Drop the events of `owner` in the present process."""
+        """Drop the events of `owner` in the current process."""
         self._events = [e for e in self._events if e.owner != owner or e.life != self.life]
         heapq.heapify(self._events)
 
 
 class Computer:
-    """Clocks, threads and bus. Args: now: device time at the start, s; unit: which of several devices.
+    """Clocks, threads and bus. Args: now: device time at the start, s. unit: number of the device.
 
-    `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
+    wall_offset_s: time by which the board's clock was set forward, s. errors: exceptions not caught by the software.
     """
 
     def __init__(self, now: float, rng: np.random.Generator, unit: int = 0) -> None:
@@ -101,9 +101,9 @@ class Computer:
             raise BusStuck(name)
 
     def spawn(self, steps: Steps, owner: str) -> None:
-        """Start a thread of the software; it runs at the present device time, after what is already due."""
+        """Start a thread of the software at the current device time, after the events that are already due."""
         self.events.add(0.0, steps, self.events.life, owner)
 
     def note(self, text: str) -> None:
-        """Remember an error or an end of the software."""
+        """Record an error or an end of the software."""
         self.errors.append(f"{self.now():.2f} {text}")

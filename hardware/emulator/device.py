@@ -1,7 +1,7 @@
 """The whole device on device time: computer, software and reactors, and how requests reach it.
 
-`ChiBioDevice` needs no thread and no socket. Requests are submitted and answered while events run: `run_until` for a
-virtual clock, `hardware/emulator/server.py` for a real one. Source: docs/device.md, Hardware, Routes and Failures.
+`ChiBioDevice` needs no thread and no socket. Requests are submitted, and answered while events run: by `run_until` on a
+virtual clock, by `hardware/emulator/server.py` in real time. Source: docs/device.md, Hardware, Routes and Failures.
 """
 
 import functools
@@ -27,10 +27,9 @@ from hardware.emulator.vial import FEED, Vial, VialConfig
 
 @functools.cache
 def plant_preset(name: str) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows. Raises: ValueError.
+    """Load the preset `conf/plant/NAME.yaml` with pulse dosing, the only dosing of the device. Raises: ValueError.
 
-    `VialConfig` stands for noise, misreadings and counts of its sensor: a vial takes only the sensor's noise-free
-    value.
+    A vial uses only the noise-free value of the preset's sensor; noise, misreadings and counts are in `VialConfig`.
     """
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     return replace(plant, pump=replace(plant.pump, dosing="pulse"))
@@ -58,10 +57,10 @@ def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
 class ChiBioDevice:
     """A Chi.Bio control computer with reactors.
 
-    Args: reactors: positions with a reactor plugged in. clock: device seconds; `handle` sleeps on it. rng: of all
-      noise, a stream per reactor. od: initial density; volumes_ml: culture up to the waste tube; one for all or one per
-      reactor. temperature: of the vials, degC. blanked: start with the zeros of clear medium; False = 65000, as after
-      power-on.
+    Args: reactors: positions with a reactor plugged in. clock: device seconds; `handle` sleeps on it. rng: source of
+      all noise, a stream per reactor. od: initial OD. volumes_ml: culture volume up to the waste tube. Each is one
+      value for all reactors or one per reactor. temperature: of the vials, degC. blanked: start with the blanks of
+      clear medium; False: 65000, as after power-on.
     Raises: ValueError for an unknown or repeated position or a wrong number of ODs.
     """
 
@@ -96,7 +95,7 @@ class ChiBioDevice:
 
     @property
     def apps(self) -> dict[str, ReactorApp]:
-        """What the software that runs, or ran last, holds of each position M0 to M7."""
+        """The apps of the positions M0 to M7 in the current, or last, software process."""
         return self.supervisor.software.apps
 
     def next_time(self) -> float:
@@ -120,7 +119,7 @@ class ChiBioDevice:
             self.supervisor.exit()
             return
         except (AppError, ArithmeticError, LookupError, TypeError, ValueError) as problem:
-            computer.note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends, silently as there
+            computer.note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends silently
             return
         deadline = self.supervisor.deadline
         if event.owner == REQUEST and events.now + pause > deadline:
@@ -135,7 +134,7 @@ class ChiBioDevice:
         yield from ()
 
     def submit(self, method: str, path: str, headers: Mapping[str, str] | None = None) -> Exchange:
-        """Hand a request to the server; run events until `done` to get its answer."""
+        """Submit a request to the server; its answer is there when events have run until it is `done`."""
         exchange = Exchange(method, path, headers or {})
         if not self.supervisor.alive:
             exchange.fate = "refused"
@@ -156,7 +155,7 @@ class ChiBioDevice:
         yield from ()
 
     def handle(self, method: str, path: str, headers: Mapping[str, str] | None = None) -> tuple[int, bytes]:
-        """Submit and wait on the clock; (status, body). Raises: ConnectionError if no answer comes."""
+        """Submit a request, wait on the clock, return status and body. Raises: ConnectionError if no answer comes."""
         self.run_until(self.clock.now())
         exchange = self.submit(method, path, headers)
         while not exchange.done:
@@ -167,5 +166,5 @@ class ChiBioDevice:
         return exchange.answer[:2]
 
     def truth(self, name: str) -> dict[str, Any]:
-        """Return what only the emulator knows of one reactor. Raises: KeyError for a position without one."""
+        """Return the true state of one reactor. Raises: KeyError for a position without a reactor."""
         return {"device_s": self._events.now} | self.vials[name].truth(self._events.now)

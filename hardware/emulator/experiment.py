@@ -13,8 +13,8 @@ from hardware.emulator.vial import StoredSample
 READINGS = 4
 READING_PAUSE_S = 0.25
 SETTLE_S = 5.0
-CYCLE_EXTRA_S = 0.05  # what a cycle's bookkeeping adds to its 60 s
-FILE_DUMP_S = 0.2  # writing the whole state; startTimeRaw reads 0 meanwhile
+CYCLE_EXTRA_S = 0.05  # time that a cycle's bookkeeping adds to its 60 s
+FILE_DUMP_S = 0.2  # to write the whole state; meanwhile startTimeRaw reads 0
 FEED_CAP = 0.02  # the on-board regulator's own limit
 
 
@@ -24,11 +24,11 @@ class Experiment:
         self._started: float | None = None
 
     def forget(self) -> None:
-        """As after `initialise()`: it was never started."""
+        """Reset the experiment as `initialise()` does: it was never started."""
         self._started = None
 
     def start_or_stop(self, value: int) -> Steps:
-        """`Experiment/<value>`: starts only if value is not 0 and nothing runs; anything else stops."""
+        """Carry out `Experiment/<value>`: start if value is not 0 and no experiment runs, else stop."""
         data, experiment = self._position.data, self._position.data["Experiment"]
         if value and experiment["ON"] == 0:
             experiment["ON"] = 1
@@ -55,7 +55,7 @@ class Experiment:
         self._position.terminal("Experiment Stopped")
 
     def _cycle(self) -> Steps:
-        """`runExperiment`: one cycle of about 60 s (docs/device.md, Cycle)."""
+        """Run one cycle of about 60 s, as `runExperiment` (docs/device.md, Cycle)."""
         data, experiment, computer = self._position.data, self._position.data["Experiment"], self._position.computer
         mine = experiment["threadCount"] = (experiment["threadCount"] + 1) % 100
         began = computer.wall()
@@ -68,7 +68,7 @@ class Experiment:
         yield SETTLE_S
         if experiment["ON"] != 0:
             yield from self._measure()
-        if experiment["ON"] == 0:  # it does not count, and `Measuring` stays 1 (docs/device.md, Cycle)
+        if experiment["ON"] == 0:  # the cycle does not count, and `Measuring` stays 1
             experiment["cycles"] -= 1
             yield from self._finish()
             return
@@ -90,7 +90,7 @@ class Experiment:
             yield from self._finish()
 
     def _measure(self) -> Steps:
-        """Four readings, their mean OD, three temperatures, fluorescence; `Measuring` is 1 from here on."""
+        """Measure the mean OD of four readings, three temperatures and fluorescence; set `Measuring` to 1."""
         od = self._position.data["OD"]
         od["Measuring"] = 1
         total = 0.0
@@ -105,7 +105,7 @@ class Experiment:
         yield from self._optics.measure_fluorescence()
 
     def _act(self) -> Steps:
-        """Regulation and light; then wait for the waste pump, then stir. Custom programs end at once on Python 3."""
+        """Regulate, switch the light, wait for the waste pump, stir. Custom programs end at once on Python 3."""
         data = self._position.data
         if data["OD"]["ON"] == 1:
             yield from self._regulate()
@@ -136,7 +136,7 @@ class Experiment:
             experiment["startTimeRaw"] = raw
 
     def _regulate(self) -> Steps:
-        """`RegulateOD`: the on-board turbidostat (docs/device.md, Regulation)."""
+        """Run the on-board turbidostat, as `RegulateOD` (docs/device.md, Regulation)."""
         data, cycles = self._position.data, self._position.data["Experiment"]["cycles"]
         if data["Volume"]["target"] == 0:
             raise AppError("division by a volume of 0")
@@ -155,7 +155,7 @@ class Experiment:
 
 
 def _feed_duty(data: SysData) -> float:
-    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up."""
+    """Return the feed pump's duty before clipping: P on ln(x / r) per minute, two integrators, 0 after a jump up."""
     od, times = data["OD"], data["time"]["record"]
     now, before = od["current"], od["record"][-1]
     target = od["target"] if od["target"] > 0 else 1e-6

@@ -1,4 +1,4 @@
-"""A Chi.Bio in software as a family: the same driver in front of a device that the run starts for itself."""
+"""The emulated Chi.Bio as a family: the driver of the real device, and an emulator that the run starts."""
 
 import logging
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from hardware.emulator.server import build, parser
 from hardware.emulator.transport import EmulatorTransport
 
 log = logging.getLogger(__name__)
-EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
+EMULATED = ("speed", "seed", "od", "plant")  # settings of backend=emulator that become options of its process
 
 
 def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
@@ -34,7 +34,7 @@ def _told(backend: EmulatorConfig) -> dict[str, str]:
 
 
 class EmulatorFamily(ChiBioFamily):
-    """A device of the run's own, which ends with it."""
+    """An emulated device that a run starts, and that ends with the run."""
 
     config = EmulatorConfig
     called = "the emulated device"
@@ -42,7 +42,7 @@ class EmulatorFamily(ChiBioFamily):
 
     @contextmanager
     def linked(self, backend: ChiBioConfig, bench: Bench) -> Iterator[Link]:
-        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock."""
+        """Start a device that ends with the run: a process, or at speed 0 an object on a virtual clock."""
         assert isinstance(backend, EmulatorConfig)
         if not backend.speed:
             log.info("emulated device inside this program, in virtual time")

@@ -1,4 +1,4 @@
-"""Faults of the emulated device that can be switched while it runs, by name: in process or over HTTP."""
+"""Faults of the emulated device, switched by name while it runs: in the same process or over HTTP."""
 
 from itertools import product
 from types import SimpleNamespace
@@ -7,7 +7,7 @@ from typing import Any
 from hardware.emulator.sysdata import SLOTS
 
 # name: (kind, allowed values, what it does)
-#   board: no reactor needed; vial: of a reactor; both are `Switches`; plant: a switch of the plant; act: done once
+#   kinds: board (of the whole device) and vial (of a reactor) are `Switches`; plant: a switch of the plant; act: once
 FAULTS: dict[str, tuple[str, str, str]] = {
     "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
     "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
@@ -15,17 +15,17 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "restart": (
         "act",
         "any",
-        "somebody starts the crashed software again, with defaults; what is unplugged then is absent",
+        "somebody starts the crashed software again, with defaults; unplugged reactors are then absent",
     ),
     "clock_step": ("act", "seconds", "the board's clock is set forward, or back if negative"),
     "cycle_dead": ("act", "any", "the experiment thread of the reactor ends; Experiment.ON stays 1"),
     "marked_absent": (
         "act",
         "any",
-        "one failed thermometer poll: present = 0, so the reactor's own threads end it all",
+        "one failed thermometer poll: present = 0, so the reactor's own threads end the software",
     ),
     "slow_s": ("board", "seconds >= 0", "network delay of every request"),
-    "hang_s": ("board", "seconds >= 0", "the next request takes so long; above 30 s the worker is killed"),
+    "hang_s": ("board", "seconds >= 0", "duration of the next request; above 30 s the worker is killed"),
     "lost_request": ("board", "count", "half-open connection: the server never sees the request"),
     "lost_reply": ("board", "count", "the server acts, its reply is never seen"),
     "reset_before": ("board", "count", "connection reset, not acted on"),
@@ -56,17 +56,17 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "internal_zero": (
         "vial",
         "count",
-        "the air thermometer reads 0 so often: a thread that measures it ends, and `OD.Measuring` stays 1",
+        "count of 0 readings of the air thermometer: each ends the thread that measures, and `OD.Measuring` stays 1",
     ),
     "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
     "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
     "overflow_gain_factor": ("plant", "factor >= 0", "flow of the overflow pump: 0 blocked, 1 sound"),
-    "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
+    "back_leak_ml": ("plant", "mL >= 0", "volume that siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
-    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; of no effect where nothing gives light"),
-    "fp_dead": ("plant", "0 or 1", "fluorescence reads 0; likewise"),
-    "fp_saturated": ("plant", "0 or 1", "fluorescence reads full scale; likewise"),
+    "fp_frozen": ("plant", "0 or 1", "fluorescence, if the culture has any, repeats its last count"),
+    "fp_dead": ("plant", "0 or 1", "fluorescence, if the culture has any, reads 0"),
+    "fp_saturated": ("plant", "0 or 1", "fluorescence, if the culture has any, reads full scale"),
 }
 PLANT = {  # fault: part of the plant, its switch
     "pump_gain_factor": ("feed", "gain_factor"),
@@ -80,20 +80,20 @@ PLANT = {  # fault: part of the plant, its switch
     "fp_saturated": ("fluorescence", "saturated"),
 }
 SIGNED = {"clock_step", "od_offset", "od_jump"}
-TYPES = {"0 or 1": bool, "count": int}  # of a switch by its allowed values, else float
+TYPES = {"0 or 1": bool, "count": int}  # type of a switch, by its allowed values; else float
 
 
 class Switches(SimpleNamespace):
-    """Fault switches of a kind, "board" or "vial", each an attribute; may be set at any time.
+    """Fault switches of a kind, "board" or "vial": one attribute each, which may be set at any time.
 
-    Counters go down with every use, -1 = until set to 0. Forks and newer apps: docs/device.md, Variants.
+    A counter goes down with every use; -1 lasts until it is set to 0. Forks and newer apps: docs/device.md, Variants.
     """
 
     def __init__(self, kind: str) -> None:
         super().__init__(**{k: TYPES.get(allowed, float)() for k, (of, allowed, _) in FAULTS.items() if of == kind})
 
     def take(self, name: str) -> bool:
-        """Is this counted fault due? Counts it down."""
+        """Return whether this counted fault is due, and count it down."""
         left: int = getattr(self, name)
         if left > 0:
             setattr(self, name, left - 1)
@@ -101,7 +101,7 @@ class Switches(SimpleNamespace):
 
 
 def inject(device: Any, name: str, reactor: str = "all", value: float = 1.0) -> None:
-    """Switch fault `name` of `FAULTS` of a `ChiBioDevice` to `value`, at a reactor, M0 to M7, or "all".
+    """Set fault `name` of `FAULTS` of a `ChiBioDevice` to `value`, at a reactor, M0 to M7, or at "all".
 
     Raises: ValueError for an unknown name, a position without reactor, or a value out of range.
     """

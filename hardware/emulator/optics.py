@@ -1,4 +1,4 @@
-"""Optical measurement: laser and spectrometer, OD from counts, the zero."""
+"""Optical measurement: laser and spectrometer, OD from counts, the blank."""
 
 import math
 from collections.abc import Generator
@@ -9,9 +9,9 @@ from hardware.emulator.sysdata import SLOTS
 
 EXPOSURE_S = 0.97  # one spectrometer reading
 FLUORESCENCE_S = 1.0  # LED on, one reading, LED off
-PYOVERDINE = ("LEDA", "nm440")  # 395 nm in, 440 nm out (docs/plant.md)
-DARK_BASE = 120.0  # counts of the base band where no culture fluoresces
-BASE = 20000.0  # and where one does
+PYOVERDINE = ("LEDA", "nm440")  # excitation 395 nm, emission 440 nm (docs/plant.md)
+DARK_BASE = 120.0  # counts of the base band if the culture does not fluoresce
+BASE = 20000.0  # counts of the base band if the culture fluoresces
 
 
 class Optics:
@@ -19,7 +19,7 @@ class Optics:
         self._position, self._outputs = position, outputs
 
     def expose(self, seconds: float) -> Generator[float, None, int]:
-        """Laser on, one reading, laser off; counts. Another thread that measures at the same time spoils it."""
+        """Return the counts of one reading with the laser on; a simultaneous reading of another thread spoils it."""
         yield from self._outputs.set_on("LASER650", 1)
         self._position.hardware().spectrometer.begin_exposure(self._position.computer.now())
         yield seconds
@@ -29,7 +29,7 @@ class Optics:
         return raw
 
     def measure_od(self) -> Steps:
-        """`MeasureOD`: OD = b r + a r^2 with r = log10(zero / raw); 0 if raw is 0. Raises: AppError for a zero of 0."""
+        """Run `MeasureOD`: OD = b r + a r^2, r = log10(blank / raw); 0 if raw is 0. Raises: AppError if blank is 0."""
         raw = yield from self.expose(EXPOSURE_S)
         zero, od = self._position.data["OD0"], self._position.data["OD"]
         zero["raw"] = float(raw)
@@ -42,7 +42,7 @@ class Optics:
         od["current"] = r * zero["LASERb"] + r * r * zero["LASERa"]
 
     def measure_fluorescence(self) -> Steps:
-        """`MeasureFP`: about a second per enabled slot; emissions are over the base."""
+        """Run `MeasureFP`: about a second per slot that is on; emissions are divided by the base."""
         for slot in (self._position.data[name] for name in SLOTS):
             if slot["ON"] == 1:
                 self._position.hardware()
@@ -53,7 +53,7 @@ class Optics:
                 slot.update({"Base": base, "Emit1": first / base, "Emit2": second / base})
 
     def _light(self) -> tuple[float, float]:
-        """Count light of the base band and of pyoverdine's; a spectrometer that fails twice gives 1 and 0."""
+        """Return the counts of the base band and of pyoverdine's band; a dead spectrometer gives 1 and 0."""
         vial = self._position.hardware()
         if vial.faults.spectrometer_dead:
             return 1.0, 0.0
@@ -61,7 +61,7 @@ class Optics:
         return (DARK_BASE, 0.0) if math.isnan(light) else (BASE, light)
 
     def calibrate(self, item: str, raw: float, od: float) -> None:
-        """`CalibrateOD`: the zero with which `raw` reads as `od` (docs/device.md, OD measurement)."""
+        """Run `CalibrateOD`: store the blank with which `raw` reads as `od` (docs/device.md, OD measurement)."""
         od0 = self._position.data["OD0"]
         a, b = od0["LASERa"], od0["LASERb"]
         od = 0 if od < 0 else od

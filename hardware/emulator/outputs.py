@@ -1,4 +1,4 @@
-"""One position M0 to M7 and what its outputs do when they are switched: lights, laser, stirrer, heater, pumps."""
+"""One position, M0 to M7, and its outputs: lights, laser, stirrer, heater, pumps."""
 
 import math
 
@@ -8,14 +8,14 @@ from hardware.emulator.vial import Vial, VialConfig
 
 BUS_S = 0.02  # a register written and read back
 PERIOD_FACTOR = 1.05  # pump period over cycle time: 63 s
-OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running motor stops, until the pause is counted
+OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running motor stops; until the period begins
 
 
 class Position:
-    """What outputs, optics and experiment of one reactor share; `data` is its sysData.
+    """State that outputs, optics and experiment of one reactor share; `data` is its sysData.
 
-    Args: name: M0 to M7; vial: what hangs on the cable, None for an empty position; device_id: what its IR thermometer
-      answers as identity; selected: reactor shown on the web page.
+    Args: name: M0 to M7. vial: the plugged vial, None for an empty position. device_id: identity that its IR
+      thermometer reports. selected: position that the web page shows.
     """
 
     def __init__(self, name: str, computer: Computer, vial: Vial | None, device_id: str, selected: str) -> None:
@@ -27,7 +27,7 @@ class Position:
         return self.vial is not None and not self.vial.faults.unplugged
 
     def forget(self, selected: str) -> None:
-        """Reset sysData as after power-on. A running thread keeps the old parts it holds, as on the device."""
+        """Reset sysData as after power-on. A running thread keeps its parts of the old sysData, as on the device."""
         self.data: SysData = fresh_sysdata(self.device_id if self.answers else "", selected)
         self.terminal("System Initialised")
 
@@ -45,7 +45,7 @@ class Position:
         return self.vial
 
     def measure_temperature(self, which: str) -> None:
-        """`MeasureTemp`. Raises: AppError for another name, or an internal thermometer that does not answer."""
+        """Run `MeasureTemp`. Raises: AppError for an unknown name or an internal thermometer that does not answer."""
         if which not in ("IR", "Internal", "External"):
             raise AppError(f"no thermometer {which}")
         meter = self.data[f"Thermometer{which}"]
@@ -72,11 +72,11 @@ class Outputs:
         self.forget()
 
     def forget(self) -> None:
-        """As after `initialise()`: no thread counted; threads of before stay alive, as they do on the device."""
+        """Reset the thread counts, as `initialise()` does; earlier threads stay alive, as on the device."""
         self._thermostats, self._pump_threads = 0, dict.fromkeys(PUMPS, 0)
 
     def set_target(self, item: str, value: float) -> Steps:
-        """`SetOutputTarget`: clamp, store, and restart the output if it is on."""
+        """Run `SetOutputTarget`: clamp and store the target, restart the output if it is on."""
         output = self._position.data[item]
         store_target(output, value)
         if output["ON"] == 1 and item not in ("OD", "Thermostat"):
@@ -84,13 +84,13 @@ class Outputs:
             yield from self.set_on(item, 1)
 
     def set_on(self, item: str, force: int) -> Steps:
-        """`SetOutputOn`: 1 on, 0 off, anything else toggles."""
+        """Run `SetOutputOn`: 1 switches on, 0 off, any other value toggles."""
         output = self._position.data[item]
         output["ON"] = force if force in (0, 1) else int(output["ON"] == 0)
         yield from self._apply(item)
 
     def _apply(self, item: str) -> Steps:
-        """`SetOutput`: the electronics do what `ON` and `target` say. Raises: AppError for what drives nothing."""
+        """Run `SetOutput`: apply `ON` and `target` to the electronics. Raises: AppError for an item without output."""
         output, now = self._position.data[item], self._position.computer.now()
         if item == "Stir":
             yield from self._stir()
@@ -113,7 +113,7 @@ class Outputs:
             raise AppError(f"{item} is no output")
 
     def _stir(self) -> Steps:
-        """Kick at full power, then down to the target; off at once."""
+        """Start the stirrer at full power, then go down to the target; switch off at once."""
         stir = self._position.data["Stir"]
         if stir["target"] * stir["ON"] > 0:
             self._position.hardware().set_stirrer(1.0, self._position.computer.now())
@@ -124,7 +124,7 @@ class Outputs:
         self._position.hardware().set_stirrer(stir["target"] * stir["ON"], self._position.computer.now())
 
     def everything_off(self) -> Steps:
-        """`turnEverythingOff`: lights, laser, pumps, stirrer, heater, thermostat."""
+        """Run `turnEverythingOff`: lights, laser, pumps, stirrer, heater, thermostat."""
         for item in (*LIGHTS, "LASER650", *PUMPS, "Stir", "Heat", "UV"):
             self._position.data[item]["ON"] = 0
         vial, now = self._position.hardware(), self._position.computer.now()
@@ -136,7 +136,7 @@ class Outputs:
             yield from self.set_on(item, 0)
 
     def _thermostat(self) -> Steps:
-        """`Thermostat`: one step of the PI law with feed-forward, every 30 s (docs/device.md, Thermostat)."""
+        """Run `Thermostat`: one step of PI control with feed-forward, every 30 s (docs/device.md, Thermostat)."""
         data, thermostat, heat = self._position.data, self._position.data["Thermostat"], self._position.data["Heat"]
         mine = self._thermostats = (self._thermostats + 1) % 100
         if thermostat["ON"] == 0:
@@ -166,7 +166,7 @@ class Outputs:
             yield from self._apply("Heat")
 
     def _period(self, item: str) -> Steps:
-        """`PumpModulation`: one period of 63 s; a newer thread of the same pump takes over.
+        """Run `PumpModulation`: one period of 63 s; a newer thread of the same pump replaces this one.
 
         Five registers are written one after another: In1, In2, In1, In2 to off, then the one that drives to on.
         """

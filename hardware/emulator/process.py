@@ -1,4 +1,4 @@
-"""An emulated device of one's own: `python -m hardware.emulator` as a child process on a free port."""
+"""Emulated device as a child process: `python -m hardware.emulator` on a free port."""
 
 import re
 import subprocess
@@ -13,14 +13,14 @@ START_S = 60.0
 
 
 class EmulatorProcess(AbstractContextManager["EmulatorProcess"]):
-    """An emulator of one's own, with url and control of its faults, as a context manager; it ends with this process.
+    """A child process with an emulator, as a context manager; it ends with this process.
 
-    Raises: LinkError with the emulator's own words if it does not start.
+    Attributes: url: address of the device. control: address of its faults. Raises: LinkError if it does not start.
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
         command = [sys.executable, "-m", "hardware.emulator", "--port", "0", "--until-eof", *arguments]
-        # a session of its own: Ctrl-C reaches the client first, which then still has a device to switch off
+        # in a new session, so that Ctrl-C ends the client first, while it can still switch the device off
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )

@@ -18,11 +18,11 @@ Answer = tuple[int, bytes, dict[str, str]]  # status, body, headers
 
 @dataclass(eq=False)
 class Exchange:
-    """One request and what became of it.
+    """One request and its outcome.
 
-    `answer` is (status, body, headers). `fate` says how it ended without one: "refused" (nobody listens), "reset"
-    (connection broken) or "lost" (silence until the client's time-out), else "". `cut` is how many body bytes to leave
-    out. `shows` is the reactor whose state the answer holds, readable; "" if none.
+    answer: status, body, headers; None before the answer. fate: how the request ended without an answer: "refused" (no
+    server listens), "reset" (connection broken) or "lost" (silence until the client's time-out), else "". cut: bytes of
+    the body to leave out. shows: reactor whose state a readable answer holds, else "".
     """
 
     method: str
@@ -39,7 +39,7 @@ class Exchange:
 
 
 class Route(NamedTuple):
-    """A path with one "*" per argument; `run(software, *arguments)` is the view, in steps if it takes time."""
+    """A path with one "*" per argument; `run(software, *arguments)` serves it, as a generator if that takes time."""
 
     method: str
     path: str
@@ -115,7 +115,7 @@ def _split(path: str) -> list[str]:
 
 
 def find_route(method: str, path: str) -> tuple[Route | None, list[str], int]:
-    """(route, arguments, 200), or (None, [], 308 | 404 | 405); 308 is a path that lacks its final slash."""
+    """Return (route, arguments, 200), or (None, [], 308 | 404 | 405); 308: the path lacks its final slash."""
     parts = _split(path)
     for found in ROUTES:
         pattern = _split(found.path)
@@ -133,7 +133,7 @@ def find_route(method: str, path: str) -> tuple[Route | None, list[str], int]:
 
 
 def answer_request(software: Software, exchange: Exchange) -> Generator[float, None, Answer]:
-    """Run one request to its answer. Raises: whatever the device's software raises on the way."""
+    """Run one request and return its answer. Raises: what the device's software raises."""
     path = unquote(exchange.path.split("?", 1)[0])
     merged = re.sub("/+", "/", path)
     found, arguments, code = find_route(exchange.method, merged)

@@ -2,10 +2,10 @@
 
     python -m hardware.emulator --port 5000 --reactors M0,M1,M2 --speed 60
 
-One request at a time, connection closed after each, like the device's single gunicorn worker. Faults and the truth are
-reached under /_emulator/ (docs/emulator.md), on the device's port and on a control port that also answers while the
-emulated software is dead. Sockets are handled here, not by a web framework, because resets, half answers and
-half-open connections are part of what is emulated.
+The server handles one request at a time and closes the connection after each, as the device's single gunicorn worker
+does. Faults and the true state are under /_emulator/ (docs/emulator.md), on the device's port and on a control port
+that also answers while the emulated software is dead. The server uses sockets, not a web framework, because it also
+emulates resets, partial answers and half-open connections.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from hardware.emulator.routes import Exchange
 from hardware.emulator.vial import SPARE, VialConfig
 
 PREFIX = "/_emulator/"
-POLL_S = 0.05  # real seconds between looks at the device when nobody asks
+POLL_S = 0.05  # real seconds between two steps of the device without a request
 CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request
 
 
 class EmulatorServer:
-    """Serves `device` on two ports until `stop`; port 0 picks a free one. Raises: OSError if one cannot be had."""
+    """Server of `device` on two ports until `stop`; port 0 picks a free port. Raises: OSError if a port is taken."""
 
     def __init__(self, device: ChiBioDevice, host: str, port: int, control_port: int) -> None:
         self.device, self.lock = device, threading.Lock()
@@ -56,7 +56,7 @@ class EmulatorServer:
         self.control_port = int(self._control.server_address[1])
 
     def stop(self) -> None:
-        """End `run` soon. May be called from a signal handler or another thread."""
+        """End `run` soon; a signal handler or another thread may call this."""
         self._stop.set()
 
     def run(self) -> None:
@@ -72,7 +72,7 @@ class EmulatorServer:
                 self._web.server_close()
 
     def _turn(self) -> None:
-        """Bring the device up to date; listen while its software lives; serve at most one request."""
+        """Bring the device up to date, listen only while its software is alive, serve at most one request."""
         self.advance()
         if not self.device.supervisor.alive and self._web is not None:
             self._web.server_close()
@@ -89,7 +89,7 @@ class EmulatorServer:
             self.device.run_until(self.device.clock.now())
 
     def exchange(self, method: str, path: str, headers: dict[str, str]) -> Exchange:
-        """One request, waited for in scaled real time."""
+        """Submit one request and wait for its answer in scaled real time."""
         self.advance()
         with self.lock:
             request = self.device.submit(method, path, headers)
@@ -131,7 +131,7 @@ def _json(value: object) -> bytes:
 
 
 class _DevicePort(HTTPServer):
-    """The device's port; fates: how connections end unanswered, "reset", or "lost": silent, in `held`."""
+    """The device's port. fates: how connections end without an answer, "reset" or "lost". held: the lost ones."""
 
     timeout = POLL_S
     allow_reuse_address = True
@@ -159,7 +159,7 @@ class _DevicePort(HTTPServer):
             connection.close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore a client that goes away: that is not an error of the server."""
+        """Ignore a client that closes its connection, because this is no error of the server."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -174,7 +174,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*connection)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Silent: thousands of requests a day."""
+        """Log nothing, because there are thousands of requests a day."""
 
     def _send(self, status: int, body: bytes, headers: dict[str, str], cut: int = 0) -> None:
         self.close_connection = True
@@ -210,33 +210,33 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(prog=program, usage=usage, description="Emulated Chi.Bio behind HTTP.")
     add, start = p.add_argument, VialConfig()
     add("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
-    add("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
+    add("--port", type=int, default=5000, help="port of the device; 0: any free port (default %(default)s)")
     add("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
     add("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
     add("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
-    add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
+    add("--seed", type=int, default=0, help="random seed of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
-    add("--volume", default="20", help="culture, mL, one for all or one per reactor (default %(default)s)")
+    add("--volume", default="20", help="culture volume, mL, one for all or one per reactor (default %(default)s)")
     for key, (usual, what, _) in OPTIONS.items():
         add(f"--{key}", default=usual, help=f"{what} (default %(default)s)")
-    add("--until-eof", action="store_true", help="end when standard input ends: with the process that holds it")
-    add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
+    add("--until-eof", action="store_true", help="end with the process that holds standard input open")
+    add("--temperature", type=float, help="initial temperature, degC (default: the preset's, usually 37)")
     plants = groups()["plant"]
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
     add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
     for pump in SPARE:
-        add(f"--{pump.lower()}-flow", type=float, default=0.0, help=f"{pump} gives a second fluid, mL/s (default: no)")
-    add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+        add(f"--{pump.lower()}-flow", type=float, default=0.0, help=f"flow of {pump} as supply pump, mL/s (default 0)")
+    add("--overflow-flow", type=float, default=1.0, help="flow of the overflow pump, mL/s (default %(default)s)")
     add(
         "--pump-start",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
         default=(start.pump_start_low_s, start.pump_start_high_s),
-        help="from the answer to a pump command until its motor turns, s (default %(default)s)",
+        help="time from the answer to a pump command until its motor turns, s (default %(default)s)",
     )
-    add("--unit", type=int, default=os.getpid(), help="which of several devices: its identities (default: own ones)")
-    add("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
+    add("--unit", type=int, default=os.getpid(), help="number of the device, sets its identities (default: unique)")
+    add("--unblanked", action="store_true", help="start with a blank of 65000, as after power-on")
     return p
 
 
@@ -249,7 +249,7 @@ def _numbers(what: str, given: str) -> float | list[float]:
 
 
 def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDevice:
-    """Build the device that the arguments describe; on `clock`, else in scaled real time. Raises: ValueError."""
+    """Build the device of the arguments, on `clock` or else in scaled real time. Raises: ValueError."""
     ods, volumes_ml = _numbers("od", arguments.od), _numbers("volume", arguments.volume)
     low, high = arguments.pump_start
     vial = VialConfig(
@@ -271,7 +271,7 @@ def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDe
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run until SIGINT or SIGTERM; exit status."""
+    """Run until SIGINT or SIGTERM; return the exit status."""
     arguments = parser().parse_args(argv)
     beside = arguments.port + 1 if arguments.port else 0
     control = beside if arguments.control_port is None else arguments.control_port
@@ -282,14 +282,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         server = EmulatorServer(build(arguments), arguments.host, arguments.port, control)
     except OSError as problem:
         where = f"{arguments.host}:{arguments.port}"
-        print(f"emulator: {where}: {problem.strerror or problem}; choose another or end what uses it")
+        print(f"emulator: {where}: {problem.strerror or problem}; choose another port or end the program that uses it")
         return 2
     except ValueError as problem:
         print(f"emulator: {problem}")
         return 2
 
     def orphaned() -> None:
-        while os.read(0, 4096):  # nothing, when the process that holds the other end is gone, however it went
+        while os.read(0, 4096):  # ends when the process at the other end is gone
             pass
         server.stop()
 

@@ -1,8 +1,8 @@
-"""The device's software between two starts: one app per position, and which of them the web page shows.
+"""The device's software between two starts: one app per position, and the position that the web page shows.
 
 Every activity that the device runs in a thread, or that makes a caller wait, is a generator that yields the seconds it
-sleeps; `ChiBioDevice` runs them on device time. Races between threads of the real software are therefore the same races
-between generators. Source: docs/device.md, checked against runs of the real software described there.
+sleeps; `ChiBioDevice` runs the generators on device time. They race as the threads of the real software do. Source:
+docs/device.md, checked against runs of the real software described there.
 """
 
 import json
@@ -27,14 +27,14 @@ class ReactorApp(Position):
         self.experiment = Experiment(self, self.outputs, self.optics)
 
     def initialise(self, selected: str) -> None:
-        """`initialise()`: everything forgotten. Threads of before stay alive, as they do on the device."""
+        """Reset everything, as `initialise()` does. Earlier threads stay alive, as on the device."""
         self.forget(selected)
         self.outputs.forget()
         self.experiment.forget()
 
 
 class Software:
-    """Memory of one process, with every position as after `initialise()`; vials, by position, hang on a cable."""
+    """Memory of one process; at first every position is as after `initialise()`. Args: vials: by plugged position."""
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
         self.computer, self.selected = computer, "M0"
@@ -45,7 +45,7 @@ class Software:
         }
 
     def app(self, name: str) -> ReactorApp:
-        """Return the app of a position as routes name it; "0" is the selected one. Raises: KeyError."""
+        """Return the app of a position in a route; "0" is the selected position. Raises: KeyError."""
         return self.apps[self.selected if name == "0" else name]
 
     def select(self, name: str) -> None:
@@ -54,19 +54,19 @@ class Software:
             app.data["UIDevice"] = name
 
     def foreign_select(self) -> None:
-        """Somebody else's page selects another reactor, as often as that fault is switched on."""
+        """Select another reactor, as another client's page does, with the probability of the fault foreign_selects."""
         rng, faults = self.computer.rng, self.computer.faults
         if len(self._reactors) > 1 and rng.random() < faults.foreign_selects:
             self.select(str(rng.choice([m for m in self._reactors if m != self.selected])))
 
     def shown(self, name: str) -> None:
-        """Note that a client was sent all records of reactor `name`."""
+        """Note that a client received all records of reactor `name`."""
         app = self.apps[name]
         if app.vial is not None and app.data["time"]["record"]:
             app.vial.reads.append(self.computer.now())
 
     def sysdata(self) -> bytes:
-        """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
+        """Return the body of getSysdata: state of the selected reactor, sorted keys, NaN as a bare token."""
         data, faults = self.apps[self.selected].data, self.computer.faults
         data["presentDevices"] = {name: app.data["present"] for name, app in self.apps.items()}
         if faults.terminal_as_list or faults.terminal_named or faults.extra_fields:
@@ -86,6 +86,6 @@ class Software:
 
 
 def device_id(name: str, unit: int) -> str:
-    """Four ID words of the IR thermometer at a position, decimal strings joined; no two units have the same."""
+    """Return the four ID words of a position's IR thermometer, as joined decimals; unique for unit and position."""
     k = int(name[1])
     return f"{1000 + k}{2000 + 7 * k}{3000 + 11 * k + 100 * (unit // 40000)}{4000 + 13 * k + unit % 40000}"

@@ -1,4 +1,4 @@
-"""gunicorn: its worker serves one request at a time; starts and ends of the software, the watchdog's power latch."""
+"""Emulated gunicorn, whose worker serves one request at a time: starts and ends of the software, the power latch."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ from hardware.emulator.vial import Vial
 
 REQUEST = "request"  # owner of the events of the request being served
 ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>Internal Server Error</h1>\n"
-BOOT_S = 8.0  # from a dead worker to a serving one
-REQUEST_S = 0.005  # what any request takes
+BOOT_S = 8.0  # from the end of a worker until the next one serves
+REQUEST_S = 0.005  # least time of a request
 WORKER_TIMEOUT_S = 30.0  # gunicorn kills a worker whose request takes longer
 POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software stopped
 
@@ -19,9 +19,9 @@ POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software
 class Supervisor:
     """Emulated gunicorn supervisor: runs at most one worker and queues its requests.
 
-    Args: vials: whose power it switches.
-    Attributes: software, of the current or last worker; deadline, when the worker is killed for a slow request; alive,
-      whether requests are accepted; restarts and exits, counts.
+    Args: vials: vials whose power the watchdog's latch switches.
+    Attributes: software: that of the current or last worker. deadline: time at which the worker is killed for a slow
+      request. alive: requests are accepted. restarts, exits: number of restarts of a worker and of ends of gunicorn.
     """
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
@@ -32,7 +32,7 @@ class Supervisor:
         self._start()
 
     def _start(self) -> None:
-        """Import of the app: every position initialised, power on, all outputs off; then its worker serves."""
+        """Start the software: power on, every position initialised, all outputs off; then serve requests."""
         self._computer.faults.bus_stuck = False
         for vial in self._vials.values():
             vial.set_power(True, self._computer.now())
@@ -72,7 +72,7 @@ class Supervisor:
         self._serve_next()
 
     def _end_process(self) -> None:
-        """Threads and memory are gone, and the request being served breaks off; the latch cuts the power soon."""
+        """End the process: threads and memory are lost, the current request is reset, and the latch soon cuts power."""
         events = self._computer.events
         events.life += 1
         self._ready = False
@@ -90,7 +90,7 @@ class Supervisor:
             vial.set_power(False, self._computer.now())
 
     def kill_worker(self) -> None:
-        """Replace the worker as gunicorn does: state wiped, requests wait until the new one has booted."""
+        """Replace the worker as gunicorn does: its state is lost, and requests wait until the new worker has booted."""
         self._computer.note("worker killed")
         self._end_process()
         self._start_soon()
@@ -106,7 +106,7 @@ class Supervisor:
         yield from ()
 
     def exit(self) -> None:
-        """Exit code 4: gunicorn gives up; no more requests are accepted."""
+        """End gunicorn, as exit code 4 of a worker does: no more requests are accepted."""
         self._end_process()
         self.alive = False
         self.exits += 1
@@ -114,18 +114,18 @@ class Supervisor:
             self._waiting.popleft().fate = "reset"
 
     def crash(self) -> None:
-        """Fault: the software ends itself, as after too many bus failures."""
+        """Make the software end itself, as after too many bus failures."""
         self._computer.note("crashed on demand")
         self.exit()
 
     def cut_power(self) -> None:
-        """Fault: the whole board loses power; its clock starts again at its first date."""
+        """Cut the power of the whole board; its clock starts again at its first date."""
         self.crash()
         self._computer.wall_offset_s = -self._computer.now()
         self._power_off()
 
     def restart(self) -> None:
-        """Somebody starts the software again by hand: defaults, nothing running."""
+        """Start the ended software again, as a user does: with defaults and without an experiment."""
         if not self.alive:
             self.alive = True
             self._start_soon()

@@ -1,4 +1,4 @@
-"""The device's memory: the sysData dictionary of one reactor as it is after `initialise()`, and its record lists."""
+"""The device's memory: the sysData dictionary of one reactor after `initialise()`, and its record lists."""
 
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -37,10 +37,10 @@ def _slot(led: str, emit1: str, emit2: str) -> SysData:
 
 
 def fresh_sysdata(device_id: str, selected: str) -> SysData:
-    """Every field of one reactor after `initialise()` (docs/device.md, State fields; a real server's recorded answer).
+    """Build all fields of one reactor after `initialise()` (docs/device.md, State fields; from a real server's answer).
 
     Args:
-      device_id: decimal ID of the reactor, "" where none is plugged in; selected: what the web page shows, "M0".
+      device_id: decimal ID of the reactor, "" if none is plugged in. selected: position that the web page shows.
     """
     spectral = (*BANDS, "DARK", "ExtGPIO", "ExtINT", "FLICKER")
     data: SysData = {
@@ -105,7 +105,7 @@ def clear_terminal(data: SysData, stamp: str) -> None:
 
 
 def _series(data: SysData) -> Iterator[tuple[SysData, str, float]]:
-    """Every record list with the value it gets at the end of a cycle: (its dictionary, its key, value)."""
+    """Yield, for every record list, its dictionary, its key and the value to append at the end of a cycle."""
     yield data["OD"], "record", data["OD"]["current"]
     yield data["OD"], "targetrecord", data["OD"]["target"] * data["OD"]["ON"]
     yield data["Thermostat"], "record", data["Thermostat"]["target"] * float(data["Thermostat"]["ON"])
@@ -129,7 +129,7 @@ def append_records(data: SysData, started: float) -> None:
 
 
 def thin_records(data: SysData) -> None:
-    """Above 200 entries, keep about every other old one and the newest 10 (201 become 109; docs/device.md, Records)."""
+    """Thin lists above 200 entries: keep about every other old entry and the newest 10 (docs/device.md, Records)."""
     times = data["time"]["record"]
     if len(times) <= THIN_ABOVE:
         return

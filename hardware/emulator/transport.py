@@ -1,4 +1,4 @@
-"""Link to an emulated device in the same process: no socket, and on a virtual clock no waiting."""
+"""Link to an emulated device in the same process: without a socket and, on a virtual clock, without waiting."""
 
 from hardware.clock import Clock
 from hardware.emulator.device import ChiBioDevice
@@ -9,10 +9,10 @@ HEADERS = {"X-Requested-With": "XMLHttpRequest"}
 
 
 class EmulatorTransport(Transport):
-    """A link whose other end is `device`; time passes on the device's clock. Nothing to disarm, nothing to close.
+    """A link to `device`; time passes on the device's clock. There is nothing to disarm or close.
 
-    Like a client on a network it gives up after `timeout_s` while the server carries on with what it began, and every
-    later request waits its turn behind that. Raises: ValueError for a time-out not positive.
+    As over a network, the client gives up after `timeout_s`, while the server continues the request and every later
+    request waits for it. Raises: ValueError if the time-out is not positive.
     """
 
     def __init__(self, device: ChiBioDevice, timeout_s: float = 20.0) -> None:

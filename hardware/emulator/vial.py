@@ -1,7 +1,7 @@
-"""The hardware behind the device's chips: one vial with its pumps, heater, stirrer and light path, and what can break.
+"""The hardware behind the device's chips: one vial with its pumps, heater, stirrer, light path and faults.
 
-Seconds are device seconds. The culture is a `Plant` with one vial; the optics (blank, counts, noise) and the
-electronics (power, motors, faults) are here, because the device sees counts, not OD.
+Seconds are device seconds. The culture is a `Plant` with one vial. The optics (blank, counts, noise) and the
+electronics (power, motors, faults) are here, because the device reads counts, not OD.
 """
 
 from collections import deque
@@ -19,18 +19,18 @@ FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
 
 FULL_SCALE = 65535
-AIR_C = 24.0  # outside
-DARK_COUNTS = 3.0  # what the spectrometer counts without light
+AIR_C = 24.0  # outside the reactor
+DARK_COUNTS = 3.0  # of the spectrometer without light
 LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
-STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
-STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has failed: cells settle
+STIR_SETTLE_S = 2.0  # readings less than this after a stop of the stirrer are disturbed
+STIR_STOPPED_S = 90.0  # cells settle if the stirrer is off for longer
 DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
 READS_KEPT = 30_000  # per reactor; a day of the driver's reads is 12000
 
 
 class Dose(NamedTuple):
-    """One run of a motor: start and length in device seconds, direction 1 or -1, fresh medium delivered in mL."""
+    """One run of a motor: start and duration, device s, direction 1 or -1, fresh medium delivered, mL."""
 
     pump: str
     start_s: float
@@ -40,7 +40,7 @@ class Dose(NamedTuple):
 
 
 class StoredSample(NamedTuple):
-    """One record of the experiment: when it became readable, the cycle's time and OD as recorded, the culture's OD."""
+    """One record of the experiment: time when it was stored, recorded time and OD, and the culture's true OD."""
 
     stored_s: float
     sample_s: float
@@ -53,8 +53,8 @@ class VialConfig:
     """Optics and electronics of a reactor.
 
     The blank is drawn once per reactor (docs/device.md, OD measurement). With the default noise the mean of four
-    readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor). A motor's start is what the thread's register writes
-    take on the bus: 0.2 to 0.7 s is what the device's own software took on simulated electronics with bus time.
+    readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor). A motor starts after the register writes of its thread:
+    0.2 to 0.7 s in runs of the device's software with simulated electronics and bus times.
     """
 
     blank_low: float = setting(11600.0, "lowest counts of clear medium", within=(3000, 60000))
@@ -73,10 +73,10 @@ class VialConfig:
     pump_start_low_s: float = setting(
         0.2, "shortest time from the reply to a pump command until the motor turns", "s", within=(0, 5)
     )
-    pump_start_high_s: float = setting(0.7, "longest such time", "s", at_most=5.0)
+    pump_start_high_s: float = setting(0.7, "longest time until the motor turns", "s", at_most=5.0)
     pump3_ml_s: float = setting(0.0, "flow of Pump3 if it supplies a second fluid", "mL/s", within=(0, 5))
     pump4_ml_s: float = setting(0.0, "flow of Pump4 if it supplies a second fluid", "mL/s", within=(0, 5))
-    overflow_pump: str = setting("", "pump whose tube ends a little above the waste tube", choices=(*SPARE, ""))
+    overflow_pump: str = setting("", "pump whose tube ends slightly above the waste tube", choices=(*SPARE, ""))
 
     def __post_init__(self) -> None:
         check(self, "vial")
@@ -89,7 +89,7 @@ class VialConfig:
 
 
 class Spectrometer:
-    """One laser and the chip that counts its light; `blank` is the count of clear medium. Args: rng: its noise."""
+    """A laser and the chip that counts its light. `blank`: counts of clear medium. Args: rng: source of its noise."""
 
     def __init__(self, config: VialConfig, faults: Switches, rng: np.random.Generator) -> None:
         self._config, self._faults, self._rng = config, faults, rng
@@ -103,20 +103,20 @@ class Spectrometer:
         self._laser_since = at if on else np.nan
 
     def begin_exposure(self, at: float) -> None:
-        """Start integrating light, and forget what another thread had begun to integrate."""
+        """Start to integrate light; this discards an integration that another thread has begun."""
         self._lit_before = self._lit_s(at)
 
     def _lit_s(self, at: float) -> float:
         return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
 
     def counts(self, at: float, exposure_s: float, od: float, moving: bool) -> int:
-        """One spectrometer reading of the laser, 16-bit counts, at device second `at`.
+        """Return one reading of the laser's light, 16-bit counts, at device second `at`.
 
-        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred (moving) or
-        half-lit readings are lower: it should have been lit for exposure_s since `begin_exposure`.
+        raw = blank 10^-R, where LINEAR R + QUADRATIC R^2 is the noise-free OD. Readings are lower while stirring
+        (moving), or if the laser was on for less than exposure_s since `begin_exposure`.
         """
         f, c, rng = self._faults, self._config, self._rng
-        if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
+        if at - self._measured_at > 10.0:  # a new measurement draws its common noise
             self._common, self._jump = rng.normal(0.0, c.common_fraction), f.od_jump
             f.od_jump = 0.0
             if rng.random() < c.outlier_rate:
@@ -138,10 +138,10 @@ class Spectrometer:
 
 
 class Vial:
-    """One reactor, a plant of one vial, as the chips see it.
+    """Hardware of one reactor around a plant of one vial.
 
-    `doses` holds what the motors did, `samples` what the software recorded, `reads` when a client was sent the newest
-    sample (device s), all also over restarts; `on_s` the motors' total on-time, `peak_ml` the highest volume.
+    doses: runs of the motors. samples: records of the software. reads: device times at which a client received the
+    newest sample. All three survive restarts. on_s: total on-time of each motor. peak_ml: highest volume so far.
     """
 
     def __init__(self, plant: Plant, config: VialConfig, rng: np.random.Generator, start: float = 0.0) -> None:
@@ -162,7 +162,7 @@ class Vial:
         self._since: dict[str, tuple[float, float]] = {}
 
     def motor(self, pump: str) -> int:
-        """Return what the motor really does: 1, -1 or 0."""
+        """Return the motor's true direction: 1, -1 or 0."""
         if not self.powered or self.faults.unplugged:
             return 0
         stuck = {FEED: self.faults.feed_stuck_open, WASTE: self.faults.waste_stuck_open}
@@ -176,7 +176,7 @@ class Vial:
             self._book(before, at)
 
     def set_power(self, on: bool, at: float) -> None:
-        """Set the watchdog's latch: without power every output is off, and stays off until it is written again."""
+        """Set the watchdog's power latch: without power every output goes off, and stays off until written again."""
         before = self._running(at)
         self.powered = on
         if not on:
@@ -187,7 +187,7 @@ class Vial:
         self._book(before, at)
 
     def set_fault(self, name: str, value: bool | float, at: float) -> None:
-        """Switch one field of `faults`; a stirrer that dies stops at once."""
+        """Set one field of `faults`; a dead stirrer stops at once."""
         before = self._running(at)
         setattr(self.faults, name, value)
         if self.faults.stirrer_dead:
@@ -195,7 +195,7 @@ class Vial:
         self._book(before, at)
 
     def _running(self, at: float) -> dict[str, int]:
-        """Bring the plant up to date before the motors change; what they did until now."""
+        """Bring the plant up to date before the motors change; return their directions until now."""
         self.sync(at)
         return {pump: self.motor(pump) for pump in self._motors}
 
@@ -216,7 +216,7 @@ class Vial:
         return float(self.plant.feed.delivered_ml[0]) if pump == FEED else self.supplied_ml.get(pump, 0.0)
 
     def _supply(self, seconds: float) -> float:
-        """Return what the spare pumps bring in meanwhile, mL; backwards they bring nothing."""
+        """Return the volume that the spare pumps supply in `seconds`, mL; backwards they supply nothing."""
         flows = dict(zip(SPARE, (self.config.pump3_ml_s, self.config.pump4_ml_s), strict=True))
         fluid = {pump: flow * max(self.motor(pump), 0) * seconds for pump, flow in flows.items()}
         self.supplied_ml = {pump: self.supplied_ml[pump] + ml for pump, ml in fluid.items()}
@@ -238,7 +238,7 @@ class Vial:
             self._step(min(at - self._at, LONGEST_STEP_S))
 
     def _nearly_sync(self, at: float) -> None:
-        """`sync` for a sensor: while no pump runs, a culture does not change within two seconds."""
+        """Bring the plant up to date for a sensor: up to 2 s late if no pump runs, as a culture changes slowly."""
         if self._since or at - self._at > SENSOR_STEP_S:
             self.sync(at)
 
@@ -275,12 +275,12 @@ class Vial:
         return self.spectrometer.counts(at, exposure_s, float(self.plant.apparent_od[0]), moving)
 
     def fluorescence(self, at: float) -> float:
-        """One reading of the fluorescent band, whole counts; nan where nothing in it gives light."""
+        """Return one reading of the fluorescence band, whole counts; nan if the culture does not fluoresce."""
         self._nearly_sync(at)
         return float(np.round(self.plant.read_fluorescence()[0]))
 
     def truth(self, at: float) -> dict[str, Any]:
-        """Return what no client can know of the reactor at device time `at`."""
+        """Return the true state of the reactor at device time `at`."""
         self.sync(at)
         plant, vessel = self.plant, self.plant.vessel
         return {

@@ -1,3 +1,3 @@
-"""How requests travel: HTTP, serial line, and the lock that keeps a second master out.
+"""Links to devices: HTTP, serial line, MQTT, and the lock that excludes a second client.
 
 Entered by drivers. Knows bytes, no device."""

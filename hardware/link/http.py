@@ -17,19 +17,19 @@ from hardware.errors import ReactorError
 from hardware.link import messages, transport
 from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session
 
-AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
-REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
+AGENT = "board_agent/"  # start of the server's name in answers of a board agent
+REFUSED = (401, 403, 409)  # statuses of requests that the agent did not carry out
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-GRACE_S = 0.2  # the client's own time-out says more, and comes first where nothing comes at all
+GRACE_S = 0.2  # without any answer the client's own time-out comes first, because its error says more
 TOKEN = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
 
 
 @contextlib.contextmanager
 def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]:
-    """Cut a request off after `wait_s`, or by a stop; httpx's own time-out begins anew per byte.
+    """Cut a request off after `wait_s` or at a stop; httpx's own time-out restarts with every byte.
 
-    What a signal's handler raises comes after the request. In the middle it would leave a lock or the place of the
-    connection taken for good, and no pump could be switched off.
+    The exception of a signal handler is raised after the request. During the request it would leave a lock or the
+    connection's slot taken for ever, and then no pump could be switched off.
     """
     opened: list[socket.socket] = []
     came: list[BaseException] = []
@@ -107,12 +107,12 @@ def fetch(
 
 
 class HttpTransport(Transport):
-    """HTTP to a Chi.Bio server, or to the board agent before it; one connection per request, as the server closes each.
+    """HTTP to a Chi.Bio server or its board agent; one connection per request, because the server closes each.
 
-    Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
-    answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
-    Args: speed: device seconds per real second. session: by which a board agent knows this client from a second one.
-    Raises: ValueError for a malformed address; LinkError for a token's file; LinkError, ProtocolError from the calls.
+    Proxies of the environment are ignored, redirects are not followed, and compression is not requested. The whole
+    answer must come within `read_s`, so that a slow server cannot hold the control loop.
+    Args: speed: device seconds per real second. session: number by which a board agent recognizes this client.
+    Raises: ValueError for a malformed address; LinkError for an unusable token file; LinkError, ProtocolError in calls.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""MQTT: a connection to a broker, kept up by a thread of its own."""
+"""MQTT: a connection to a broker, which a thread keeps up."""
 
 import contextlib
 import importlib
@@ -14,13 +14,13 @@ from hardware.link.messages import BrokerNotReached, NoMqtt
 class MqttLink:
     """One client of a broker.
 
-    Args: name: of this client. ca_file: certificate of who signed the broker's, "": those of this computer. topics:
-      filters that are subscribed to. take: called with topic, payload and whether it was retained, on the connection's
-      thread; what it raises is lost. again: called before anything arrives on a new connection. will: topic of ours
-      whose retained message the broker clears when we are gone.
-    Attributes: broke_s, when the connection was last lost, by `clock`; lost, why, in words; refusal, why the broker
-      does not let us in, "" if it did or was not reached.
-    Raises: LinkError if the library or a certificate is missing, or the broker is not there.
+    Args: name: name of this client. ca_file: certificate authority of the broker, "": those of this computer. topics:
+      filters to subscribe to. take: called with topic, payload and retained flag, on the connection's thread; its
+      exceptions are lost. again: called on a new connection before any message. will: topic of this client, whose
+      retained message the broker clears when the client is gone.
+    Attributes: broke_s: time of the last loss of the connection, by `clock`. lost: reason of this loss. refusal: why
+      the broker refused this client, "" if it did not, or was not reached.
+    Raises: LinkError if the library or a certificate is missing, or the broker does not answer.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class MqttLink:
         self._client.on_connect, self._client.on_disconnect = self._up, self._down
 
         def on_message(_client: Any, _user: Any, message: Any) -> None:
-            with contextlib.suppress(Exception):  # the thread would end, and nobody hear of it
+            with contextlib.suppress(Exception):  # an exception would end the thread unnoticed
                 take(str(message.topic), bytes(message.payload), bool(message.retain))
 
         self._client.on_message = on_message
@@ -48,13 +48,13 @@ class MqttLink:
             if tls:
                 self._client.tls_set_context(ssl.create_default_context(cafile=ca_file or None))
             self._client.connect(host, port, keepalive=10)
-        except (OSError, ValueError) as error:  # also of TLS, and of a file that is not there
+        except (OSError, ValueError) as error:  # also of TLS, and of a missing file
             raise BrokerNotReached(broker=f"{host}:{port}", error=error) from None
         self._client.loop_start()
 
     @property
     def connected(self) -> bool:
-        """Whether the broker hears us and our thread listens."""
+        """Whether the connection is up and its thread runs."""
         thread = getattr(self._client, "_thread", None)
         return self._is_up and thread is not None and thread.is_alive()
 
@@ -63,7 +63,7 @@ class MqttLink:
         if not reason.is_failure:
             self._again()
             client.subscribe([(topic, 1) for topic in self._topics])
-            if self._kept:  # the last will of the connection before cleared it
+            if self._kept:  # the last will of the previous connection cleared it
                 client.publish(self._will, self._kept, qos=1, retain=True)
             self._is_up = True
 
@@ -78,7 +78,7 @@ class MqttLink:
             self._client.publish(topic, payload, qos=1)
 
     def keep(self, payload: str) -> None:
-        """Keep a retained message on `will`, as long as we are there."""
+        """Keep a retained message on `will` while this client is connected."""
         self._kept = payload
         self._client.publish(self._will, payload, qos=1, retain=True)
 

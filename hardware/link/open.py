@@ -16,11 +16,11 @@ from hardware.link.transport import Transport, TransportConfig, new_session
 
 
 class DeviceLock:
-    """A device's name in the kernel: one for all users of this computer, free when it is closed or the process ends.
+    """Lock on a device's name for all users of this computer; `close` or the end of the process releases it.
 
-    A file keeps the session under which this user is known to a board agent: who takes over from a client that was
-    killed goes on under its name and is in charge at once. One device may have several names, each is locked.
-    Raises: DeviceStateError if another process holds it.
+    A file keeps this user's session number at the board agent, so that a client that replaces a killed one is in charge
+    at once. If a device has several names, each is locked.
+    Raises: DeviceStateError if another process holds the lock.
     """
 
     def __init__(self, device: str) -> None:
@@ -48,7 +48,7 @@ class DeviceLock:
 
 @contextmanager
 def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Iterator[Transport]:
-    """Open the configured link, owned exclusively on this computer as long as it is open.
+    """Open the configured link; while it is open, no other process of this computer can use the device.
 
     Raises: ValueError for a malformed address, LinkError, DeviceStateError if another process holds the device.
     """

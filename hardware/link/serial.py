@@ -29,7 +29,7 @@ _HEADER = re.compile(rb"^<(\d{1,10}) (\d{1,3}) (\d{1,6}) ([0-9a-f]{8})$")
 
 @dataclass(frozen=True)
 class ReplyHeader:
-    """What comes before the body of a reply: ID of the request (0: it was unreadable), status, bytes of body, CRC."""
+    """Header of a reply: ID of the request (0: unreadable request), status, length of the body in bytes, CRC."""
 
     number: int
     status: int
@@ -58,11 +58,11 @@ def _text(reply: Reply) -> str:
 class SerialTransport(Transport):
     """Framed requests over a serial line to `board_agent.py`; a line that was unplugged is reopened on the next call.
 
-    The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
-    memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
+    If a reply is lost or damaged, the same request line is sent again: the agent answers a repeated ID from memory, so
+    nothing is carried out twice. The port is opened exclusively, so that no second client can use it.
     Args: port: serial device or pyserial URL. attempts: times one request line is sent before the link counts as lost.
-      session: by which the agent knows this client from a second one; the upper half of every ID.
-    Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
+      session: number by which the agent recognizes this client; the upper half of every ID.
+    Raises: LinkError if the line cannot be opened or no reply comes, ProtocolError if only damaged replies come.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SerialTransport(Transport):
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise messages.PortNotOpened(port=self.port, error=error) from error
-        self._count = random.SystemRandom().randrange(2**15)  # a late reply to an earlier life has another ID
+        self._count = random.SystemRandom().randrange(2**15)  # late replies to an earlier client have other IDs
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
         except BaseException:
@@ -118,7 +118,7 @@ class SerialTransport(Transport):
         return dict(hello)
 
     def close(self) -> None:
-        """Release the port; the agent's switch stays as it is. Idempotent."""
+        """Release the port; the agent's dead-man switch stays as it is. Idempotent."""
         if self._line is not None:
             with contextlib.suppress(OSError):  # the device may be gone already
                 self._line.close()
@@ -134,7 +134,7 @@ class SerialTransport(Transport):
         raise messages.AgentReports(request=request, status=reply.status, why=text)
 
     def _exchange(self, method: str, path: str) -> Reply:
-        """One request, repeated under the same ID until a whole reply came. Raises: LinkError, ProtocolError."""
+        """Send one request, repeated with the same ID until a whole reply comes. Raises: LinkError, ProtocolError."""
         if self._line is None:
             self._open()
         assert self._line is not None
@@ -146,7 +146,7 @@ class SerialTransport(Transport):
         wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
         seconds = self._config.timeout(wait_s, self._clock)
         garbage = 0
-        last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
+        last_try = time.monotonic() + 1.5 * seconds  # no third full time-out, even if many replies are damaged
         try:
             for attempt in range(self._attempts):
                 if attempt:
@@ -163,7 +163,7 @@ class SerialTransport(Transport):
         except OSError as error:
             self.close()
             raise messages.PortLost(port=self.port, error=error) from error
-        self.close()  # a fresh session cannot be answered by stale replies
+        self.close()  # a reopened port brings no stale replies
         tried = {"request": f"{method} {path}", "port": self.port, "tries": self._attempts}
         raise messages.DamagedFrames(**tried, count=garbage) if garbage else messages.AgentSilent(**tried)
 

@@ -1,6 +1,6 @@
-"""How requests travel to a device: all that a driver knows of HTTP, serial line or emulator.
+"""Transport of requests to a device, by HTTP, serial line or to an emulator: the interface that drivers use.
 
-A transport raises `LinkError` when no answer came and `ProtocolError` when it was garbage.
+A transport raises `LinkError` if no answer came and `ProtocolError` if the answer was unreadable.
 """
 
 import json
@@ -19,14 +19,14 @@ from hardware.errors import LinkError
 from hardware.link import messages
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
-"""Reactor, pump: how many device seconds ago a dead-man switch on the way found it on and switched it off."""
+"""By reactor and pump: how many device seconds ago a dead-man switch on the link switched the pump off."""
 
 MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
 
 
 def require_web_address(key: str, url: str) -> None:
-    """Raise ValueError, naming the config's key, for what is no http or https address of a host without a path."""
+    """Check an http or https address of a host, without a path. Raises: ValueError naming the config's key."""
     try:
         parts = urlsplit(url)
         _, good = parts.port, parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
@@ -36,13 +36,13 @@ def require_web_address(key: str, url: str) -> None:
 
 
 def new_session() -> int:
-    """Draw a name for a client, 1 to 65535, by which a board agent knows it from a second one."""
+    """Draw a random client number, 1 to 65535, by which a board agent distinguishes its clients."""
     return random.SystemRandom().randrange(1, 2**16)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer as it came: HTTP status and body; `date` is the server's clock as an HTTP date, "" where unknown."""
+    """An answer: HTTP status and body; `date` is the server's clock as an HTTP date, "" if unknown."""
 
     status: int
     body: bytes
@@ -50,24 +50,24 @@ class Reply:
 
 
 class Transport(Protocol):
-    """Carries one request at a time; a driver never retries blindly what is not idempotent."""
+    """Carrier of one request at a time; a driver never repeats a request blindly unless it is idempotent."""
 
     def get(self, path: str) -> Reply:
-        """Send a GET. Raises: LinkError when no answer came."""
+        """Send a GET. Raises: LinkError if no answer came."""
         return self._request("GET", path)
 
     def post(self, path: str) -> Reply:
-        """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
+        """Send a POST without a body. Raises: LinkError if no answer came; the device may still have acted."""
         return self._request("POST", path)
 
     def _request(self, method: str, path: str) -> Reply: ...
 
     def disarm(self) -> None:
-        """Tell a dead-man switch that all pumps are verified off; the next request arms it again. Raises: nothing."""
+        """Disarm a dead-man switch, as all pumps are verified off; the next request arms it again. Raises: nothing."""
         return
 
     def switched_off(self) -> SwitchedOff:
-        """Ask a dead-man switch on the way, if there is one, what it has switched off. Raises: as `get`."""
+        """Return what a dead-man switch on the link, if there is one, has switched off. Raises: as `get`."""
         return {}
 
     def close(self) -> None:
@@ -76,12 +76,12 @@ class Transport(Protocol):
 
 
 class SharedLink(Transport):
-    """One link to a device of several reactors: what one of them waited for in vain, the others do not wait for again.
+    """One link for all reactors of a device: after a time-out of one reactor, the others do not wait for another one.
 
-    After a request that took longer than `SILENT_S` and brought no answer, every request within the next `PAUSE_S`
-    fails at once. So a silent server costs all reactors together one time-out, and they are told of it within that.
-    Where others are answered between two time-outs of one reactor, requests about that one alone fail at once, for
-    `REST_S`: it must not take its neighbours' time. heard_s is the clock time of the newest answer.
+    After a request that took longer than `SILENT_S` without an answer, every request within the next `PAUSE_S` fails at
+    once, so a silent server costs all reactors together one time-out. If other reactors are answered between two
+    time-outs of one reactor, only the requests about this reactor fail at once, for `REST_S`, so that it does not take
+    the time of the others. heard_s: clock time of the newest answer.
     """
 
     SILENT_S, PAUSE_S, REST_S = 1.0, 2.0, 40.0
@@ -89,7 +89,7 @@ class SharedLink(Transport):
     def __init__(self, link: Transport, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self.heard_s, self._again_s, self._silence = -math.inf, -math.inf, ""
-        self._silent: dict[str, tuple[float, float]] = {}  # reactor: its last time-out, and until when it rests
+        self._silent: dict[str, tuple[float, float]] = {}  # reactor: last time-out, end of its pause
 
     def _request(self, method: str, path: str) -> Reply:
         asked_s, about = self._clock.now(), path.rpartition("/")[2]
@@ -123,7 +123,7 @@ class SharedLink(Transport):
 
 
 def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff:
-    """Read from an agent's status what it has switched off, by the device's clock. Raises: ProtocolError."""
+    """Parse the status of an agent: what it has switched off, in device seconds. Raises: ProtocolError."""
     try:
         found = json.loads(status)["switched_off"]
         return {m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()}
@@ -140,9 +140,9 @@ class TransportConfig:
 
     kind: str = setting("http", "kind of link", choices=("http", "serial"))
     connect_s: float = setting(
-        3.0, "to connect; on a serial line to write, and for the agent's own replies", "s", above=0.0, below=30.0
+        3.0, "time-out to connect; on a serial line to write, and for replies of the agent", "s", above=0.0, below=30.0
     )
-    read_s: float = setting(20.0, "for a whole reply of the device", "s", above=0.0, below=30.0)
+    read_s: float = setting(20.0, "time-out for a whole reply of the device", "s", above=0.0, below=30.0)
     floor_s: float = setting(
         1.0, "shortest time-out in real seconds at any speed of an emulator", "s", above=0.0, below=30.0
     )
@@ -156,12 +156,12 @@ class TransportConfig:
         check(self, "transport")
 
     def timeout(self, seconds: float, clock: DeviceClock) -> float:
-        """Real seconds to wait for what takes `seconds` by the device's clock."""
+        """Return the time-out in real seconds for `seconds` of device time."""
         return max(clock.to_real(seconds), self.floor_s)
 
 
 def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r"[!-~]") -> str:
-    """One line of `least` to 256 characters, for the config value `key`. Raises: LinkError, never with the secret."""
+    """Read a secret of `least` to 256 characters for the config's `key`. Raises: LinkError, never with the secret."""
     file = Path(path).expanduser()
     try:
         mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()

@@ -1,1 +1,1 @@
-"""The driver of Pioreactors: from the vendor's HTTP and MQTT to samples, doses and faults of one to many units."""
+"""The driver of Pioreactors: from the vendor's HTTP and MQTT to samples, doses and faults of any number of units."""

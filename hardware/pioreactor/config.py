@@ -8,11 +8,11 @@ from hardware.clock import DeviceClock
 from hardware.link.transport import read_secret, require_web_address
 
 PASSWORD = "PIOREACTOR_MQTT_PASSWORD"
-"""Variable of the environment that holds the broker's password; without it and without a file the vendor's own."""
-SHIPPED = "raspberry"  # what the vendor's installation sets, public
+"""Environment variable with the broker's password; without this and a file, the vendor's own password is used."""
+SHIPPED = "raspberry"  # public password that the vendor's installation sets
 PUBLISHED = "26.11.1"
-"""Version of the vendor's software that the rig runs, the newest that was tried."""
-FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's most in each vial
+"""Version of the vendor's software that the rig runs: the newest tested version."""
+FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's largest volume in each vial
 
 
 def vial_ml(volume_ml: float) -> int:
@@ -22,7 +22,7 @@ def vial_ml(volume_ml: float) -> int:
 
 @dataclass(frozen=True)
 class UnitConfig:
-    """What one unit has otherwise than `backend` says. Raises: ValueError naming key, value and allowed range."""
+    """Settings of one unit that replace those of `backend`. Raises: ValueError naming key, value and allowed range."""
 
     address: str = setting("", "address of the unit's web server, e.g. http://10.42.0.2; '': http://NAME.local")
     channel: str | None = setting(None, "replaces backend.channel", choices=("1", "2", "3", "4"))
@@ -36,7 +36,7 @@ class UnitConfig:
 
 @dataclass(frozen=True)
 class PioreactorConfig:
-    """How to reach the units of a cluster, and what differs from other families. Raises: ValueError."""
+    """How to reach and run the units of a cluster. Raises: ValueError."""
 
     kind: str = setting("pioreactor", "backend")
     reactors: tuple[str, ...] = setting(("pio01",), "names of the units as on the vendor's page", some=True)
@@ -78,7 +78,7 @@ class PioreactorConfig:
         require(self.max_dose_ml >= self.min_dose_ml, "backend.max_dose_ml", f"{self.max_dose_ml} mL", least)
         require(len(self.pump_pins) == 3, "backend.pump_pins", self.pump_pins, "three: media, alt-media, waste")
         apart_s = DeviceClock(self.speed).of_real(self.reading_s)
-        two = f"more than {apart_s:g} s (reading_s * speed), or no two readings fall into it and there is no sample"
+        two = f"more than {apart_s:g} s (reading_s * speed), because a sample needs two readings"
         require(self.window_s > apart_s, "backend.window_s", f"{self.window_s} s", two)
         unknown = [name for name in self.units if name not in self.reactors]
         require(not unknown, "backend.units", tuple(unknown), f"names of {', '.join(self.reactors)}")
@@ -86,7 +86,7 @@ class PioreactorConfig:
         require(not bad, "backend.experiment", self.experiment, "a name without # + and /")
 
     def of(self, unit: str) -> "PioreactorConfig":
-        """As one unit has it: its own values in the place of those for all."""
+        """Return the config of one unit: its own values replace those of all units."""
         own = self.units.get(unit, UnitConfig())
         keys = [key for key in ("channel", "od_zero", "od_scale") if getattr(own, key) is not None]
         return replace(self, **{key: getattr(own, key) for key in keys})
@@ -95,7 +95,7 @@ class PioreactorConfig:
         return (self.units.get(unit, UnitConfig()).address or f"http://{unit}.local").rstrip("/")
 
     def password(self) -> str:
-        """Of the broker; it stands in no config, file of a run or line of the screen. Raises: LinkError."""
+        """Return the broker's password, which no config, file of a run or output contains. Raises: LinkError."""
         remedy = "one line with the broker's password, mode 600"
         if not self.password_file:
             return os.environ.get(PASSWORD, SHIPPED)
@@ -104,10 +104,10 @@ class PioreactorConfig:
 
 @dataclass(frozen=True)
 class RigConfig:
-    """Which software the rig runs, and what its vials are. Raises: ValueError naming key, value and allowed range."""
+    """Software and vials of the rig. Raises: ValueError naming key, value and allowed range."""
 
     package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or path of a wheel")
-    folder: str = setting("", "folder of the environments; empty: the user's cache")
+    folder: str = setting("", "folder of the Python environments; '': the user's cache")
     od: float = setting(0.7, "OD of the cultures at the start", "OD", within=(0.0, 4.0))
     plant: str = setting("nominal", "preset of the cultures")
     seed: int = setting(0, "random seed of the vials", at_least=0)
@@ -118,7 +118,7 @@ class RigConfig:
 
 @dataclass(frozen=True)
 class RigBackendConfig(PioreactorConfig):
-    """`backend=pioreactor_rig`: the same driver against the vendor's software around our vials, started for the run."""
+    """`backend=pioreactor_rig`: the same driver with the vendor's software and simulated vials, started for the run."""
 
     kind: str = setting("pioreactor_rig", "backend")
     speed: float = setting(10.0, "speed-up of growth: device seconds per real second", within=(1, 60))

@@ -1,7 +1,7 @@
-"""One dose from intent to its end: media, then waste, each a job of the vendor's with our id; never sent twice.
+"""Doses of one unit, from intent to end: media, then waste, each a job of the vendor with the dose's id; sent once.
 
-After one whose fate is not known nothing is dosed until it is certain that it cannot run any more. What a dose gave is
-on record with the least and the most, and what was booked otherwise when it began is corrected.
+While it is unknown whether a dose will run, no further dose begins. The end of a dose is recorded with its smallest and
+largest volume, and corrects the volume that was booked when the dose began.
 """
 
 import math
@@ -21,13 +21,13 @@ from hardware.stations import Plan
 from hardware.storage.doses import Ending, Given, feeds_by
 from hardware.storage.history import History
 
-DRAIN_ML = 4.0  # at a time and more, while a media pump runs on
-DRAINS = 5  # attempts to empty a vial after that
+DRAIN_ML = 4.0  # least volume of one drain while a media pump runs on
+DRAINS = 5  # most drains of a vial after that
 
 
 @dataclass(frozen=True)
 class UnitHistory(History):
-    """One unit's past; boot, when it had been started; of an open dose pump, id and task, the answer to its request."""
+    """One unit's past. boot: when it was started. pump, id, task: of an open dose; the request's reply has the task."""
 
     boot: str = ""
     pump: int = 1
@@ -52,8 +52,9 @@ replay = UnitHistory.replay
 class Doses:
     """The doses of one unit, one at a time, at most one per sample.
 
-    Attributes: ended_s, real time at which the last was over; foreign, what was dosed without our command; extra, what
-      was given beyond what was booked when doses began, until that is booked; refused, why each of the last gave none.
+    Attributes: ended_s: real time at which the last dose ended. foreign: fault of a dose that this run did not command.
+      extra: volumes given beyond those booked when doses began, until the caller books them. refused: why the last
+      doses gave nothing, one entry each.
     """
 
     def __init__(self, pumps: Pumps) -> None:
@@ -64,28 +65,28 @@ class Doses:
         self.refused = list[Message]()
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
-        self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
+        self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; more overflows
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
         self._ran_s, self._strange_ml = dict.fromkeys(PUMPS, 0.0), dict.fromkeys(PUMPS, 0.0)
-        self._job = MEDIA  # that gave the last dose
-        self._now_ml, self._told_ml = np.zeros(3), np.zeros(3)  # fed at most, at least, risen: in truth, and booked
+        self._job = MEDIA  # job of the last dose
+        self._now_ml, self._told_ml = np.zeros(3), np.zeros(3)  # largest, smallest feed, rise: estimated; and booked
         self._base_ml, self._taken_ml, self._ran_on = np.zeros(2), 0.0, False  # fed before this dose; of this dose
 
     @property
     def running(self) -> bool:
-        """Whether a dose is under way, or the fate of one unknown."""
+        """Whether a dose is under way, or may still run."""
         return self._course is not None
 
     def restore(self, history: UnitHistory) -> None:
-        """Restore the state before a resume; the outcome of an open dose is looked for, the dose never sent again."""
+        """Restore the state before a resume; find the outcome of an open dose, but never request it again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
         if history.open:
             plan, self._job = Plan(history.feed_ml, history.waste_ml), ALT if history.pump == SPARE else MEDIA
             self._course = self._drained(self._look_for(history, plan), plan, history.id)
 
     def plan(self, rate: float, pump: int = 1) -> Plan:
-        """Plan the dose of a period, mL, by mean rate, mL/s, and number of its pump. Raises: ValueError."""
+        """Plan the dose of one period from its mean rate, mL/s, and the number of its pump. Raises: ValueError."""
         if not (rate >= 0.0 and math.isfinite(rate)):
             raise ValueError(f"pump rate = {rate} mL/s: allowed finite numbers >= 0")
         carries = rate > 0.0 and pump != SPARE
@@ -96,7 +97,7 @@ class Doses:
         return Plan(feed, self._config.waste_factor * feed, 0.0 if carries else self.carry_ml)
 
     def begin(self, rate: float, sample: tuple[float, int] | None, refusal: Message | None, pump: int = 1) -> Plan:
-        """Begin the dose for `sample`, or note what stands against it. Raises: as `plan`; what the log raises."""
+        """Begin the dose for `sample`, or note the reason against it. Raises: as `plan`; what the log raises."""
         plan = self.plan(rate, pump)
         if reason := refusal or self._obstacle(sample):
             if plan.feed_ml > 0.0:
@@ -139,7 +140,7 @@ class Doses:
             self._settle_strange()
 
     def take(self, events: list[Event]) -> None:
-        """Take dosing events; book those of no dose of this run after the dose under way."""
+        """Add dosing events; those that belong to no dose of this run are booked after the current dose."""
         for event in events:
             key = event.pump, event.source
             self.pumps.reported[key] = max(self.pumps.reported[key] + event.ml, 0.0)  # a correction is negative
@@ -149,15 +150,15 @@ class Doses:
             self._settle_strange()
 
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
-        self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
+        self._book.log("feed_on", on_s=on_s, id=dose)  # before the request, which may be carried out
         media, waste = (yield from self.pumps.give(self._job, plan.feed_ml, dose)), Moved()
-        most_ml = max(plan.waste_ml, plan.feed_ml + LATE_ML)  # of a job that ended late: its waste takes that, too
+        most_ml = max(plan.waste_ml, plan.feed_ml + LATE_ML)  # a job that ended late is drained by its waste, too
         if 0.0 < media.high <= most_ml and not (WASTE in self.pumps.barred or self._ran_on):
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
         self._conclude(plan, dose, on_s, media, waste)
 
     def _look_for(self, history: UnitHistory, plan: Plan) -> Iterator[float]:
-        """Look for the outcome of the dose that was open before a resume; it may still run."""
+        """Find the outcome of the dose that was open before a resume and may still run."""
         pumps, dose, asked_ml = self.pumps, history.id, plan.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
@@ -169,8 +170,8 @@ class Doses:
                 pin = pumps.pins[self._job]
                 found, there = Request(self._job, 0.0, dose, now, pin.ran_s), pin.on or pumps.box.live(self._job)
                 asked = found._replace(ml=asked_ml, asked_s=now - ago_s, task=history.task)
-                if lost := pumps.box.state(self._job).word == "lost":  # its pin may be on since, and nobody told it
-                    pin.inits.append(asked.asked_s)  # no later word is that of its own process
+                if lost := pumps.box.state(self._job).word == "lost":  # its pin may be on without a report
+                    pin.inits.append(asked.asked_s)  # a later report is of another process
                 seen = yield from pumps.follow(asked) if there else pumps.end(asked if lost else found)
                 media = seen._replace(
                     low=0.0, high=max(seen.high, asked_ml), end=(seen.end if seen.high else None) or unseen
@@ -190,7 +191,7 @@ class Doses:
         self._fed(media.high, media.low, waste.low)
 
     def _fed(self, high_ml: float, low_ml: float, taken_ml: float = 0.0) -> None:
-        """Count what this dose fed up to now, and what was taken since; little is booked once it is much."""
+        """Update the feed of this dose and the volume removed since; book the changes once they exceed LATE_ML."""
         fed_ml = self._base_ml + np.array([high_ml, low_ml])
         rise_ml = min(self._now_ml[2] + max(fed_ml[0] - self._now_ml[0], 0.0), self._room_ml)
         self._now_ml = np.array([*fed_ml, max(rise_ml - taken_ml, 0.0)])
@@ -201,9 +202,9 @@ class Doses:
             self._told_ml = self._now_ml
 
     def _drained(self, course: Iterator[float], plan: Plan, name: str) -> Iterator[float]:
-        """Go through a dose, and drain the vial beside and after it of what a media pump gives that runs on.
+        """Run the steps of a dose; if its media pump runs on, drain the vial during the dose and after it.
 
-        What it may have given is booked as it flows. Args: plan: what was booked when it began. name: of the drains.
+        The largest possible feed is booked as it flows. Args: plan: volumes booked at the start. name: id of drains.
         """
         self._base_ml, self._taken_ml, self._ran_on, self.pumps.flowed_ml = self._now_ml[:2], 0.0, False, 0.0
         rise_ml = max(self._told_ml[2] + plan.feed_ml - plan.waste_ml, 0.0)
@@ -226,7 +227,7 @@ class Doses:
             yield STEP_S
 
     def _portion(self, ml: float, name: str) -> Iterator[float]:
-        """Drain a portion by the waste pump; count its reported volume, in the end its known volume."""
+        """Drain `ml` by the waste pump; count the reported volume, at the end the known volume."""
         before_ml, course, over = self._taken_ml, self.pumps.give(WASTE, ml, name), False
         self._book.tell(messages.Drained(ml=ml))
         while not over:
@@ -240,7 +241,7 @@ class Doses:
             self._fed(high_ml, low_ml, more_ml)
 
     def _silence(self, job: str, name: str) -> Iterator[float]:
-        """End a pump that runs without a job, or whose job was killed, and record what it moved."""
+        """End a pump that runs without a job, or whose job was killed, and record the volume that it moved."""
         pin = self.pumps.pins[job]
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
         moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
@@ -253,9 +254,9 @@ class Doses:
             self._fed(moved.high, moved.low)
 
     def _settle_pins(self) -> None:
-        """Book what pumps gave between our doses by their pins, as far as no event told it: jobs drive them, too.
+        """Book volumes that pumps gave between this run's doses by their pins and that no event reported.
 
-        What the waste pump took meanwhile is booked with the media: its event may have come, and counted, before.
+        The waste pump's volume of that time is booked with the media, because its event may have been counted before.
         """
         beside_ml = (self.pumps.pins[WASTE].ran_s - self._ran_s[WASTE]) * self.pumps.flow_ml_s[WASTE]
         for job in self.pumps.jobs:
@@ -267,12 +268,12 @@ class Doses:
                     self._theirs(job, ran_ml, "by its pin", 0.0 if job == WASTE else beside_ml)
 
     def _settle_strange(self) -> None:
-        """Book what was dosed without a command of this run, beyond what was counted already."""
+        """Book volumes that events reported without a command of this run, beyond those counted already."""
         strange, self._strange = self._strange, []
         for job, source in dict.fromkeys((event.pump, event.source) for event in strange):
             counted = self.pumps.counted[job, source]
             over = self.pumps.reported[job, source] - counted
-            ours = source.startswith(self.pumps.ours)  # what is booked of it may be more than was reported
+            ours = source.startswith(self.pumps.ours)  # more may be booked than reported
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
             self.pumps.counted[job, source] = counted + over
@@ -287,7 +288,7 @@ class Doses:
         self._give(job, ml, ml, self.foreign.sentence, beside_ml)
 
     def _give(self, job: str, low_ml: float, high_ml: float, why: str, beside_ml: float = 0.0) -> None:
-        """Record what a pump moved beside our doses: when it was noticed, how much, by whom."""
+        """Record a volume that a pump moved without a dose of this run, at the time it was noticed."""
         fed = job != WASTE
         waste_ml = beside_ml if fed else high_ml
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, waste_ml, NUMBERS[job])

@@ -1,4 +1,4 @@
-"""Pioreactors as a family: the units that no other client has, their preflight, and what the interlock counts with."""
+"""Pioreactors as a family: exclusive access to units, their preflight, and their volumes and dose limits."""
 
 import math
 from collections.abc import Iterator
@@ -31,14 +31,14 @@ class PioreactorFamily(Family):
     called = "Pioreactors"
 
     def reached(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> Reached:
-        """Return the config by which the units are reached for as long as the run lasts. Raises: ReactorError."""
+        """Return, as a context, the config with which a run reaches the units. Raises: ReactorError."""
         return nullcontext(backend)
 
     @contextmanager
     def units(
         self, backend: PioreactorConfig, bench: Bench, folder: Path, log_row: Log = no_log, run: str = ""
     ) -> Iterator[PioreactorReactors]:
-        """Units that no other client on this computer has. Raises: ReactorError."""
+        """Open units that no other client on this computer uses. Raises: ReactorError."""
         with ExitStack() as stack:
             backend = stack.enter_context(self.reached(backend, bench, folder))
             for unit in backend.reactors:
@@ -66,7 +66,7 @@ class PioreactorFamily(Family):
 
     def tube(self, backend: PioreactorConfig, number: int, most_ml: float, who: str) -> None:
         if not backend.alt_media:
-            remedy = "give it one, calibrate it in the vendor's page and set backend.alt_media=true"
+            remedy = "connect a tube, calibrate the pump in the vendor's page and set backend.alt_media=true"
             raise UnfitError(f"{who}: pump {number}, the vendor's alt-media pump, has no tube; {remedy}")
 
     def no_thermostat(self, backend: PioreactorConfig) -> str | None:
@@ -80,13 +80,13 @@ class PioreactorFamily(Family):
         for name, ml, full_ml in zip(backend.reactors, volumes_ml, self.rim_ml(volumes_ml), strict=True):
             if ml >= full_ml:
                 given = f"bench.volume_ml = {ml:g} mL of {name}"
-                raise UnfitError(f"{given}: allowed less than the vendor's limit of its vial, {full_ml:g}")
+                raise UnfitError(f"{given}: allowed less than the vendor's limit of this vial, {full_ml:g}")
         if bench.max_rate * bench.period_s > backend.max_dose_ml + 1e-9:
             least = math.floor(1e5 * backend.max_dose_ml / bench.period_s) / 1e5
             raise UnfitError(
                 f"{where}: backend.max_dose_ml = {backend.max_dose_ml:g} mL, the interlock allows "
                 f"{bench.max_rate * bench.period_s:.3g} mL in a period of {bench.period_s:g} s; "
-                f"give bench.max_rate={least:g} or a larger backend.max_dose_ml"
+                f"set bench.max_rate={least:g} or a larger backend.max_dose_ml"
             )
 
     def rim_ml(self, volumes_ml: Array) -> Array:

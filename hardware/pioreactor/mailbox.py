@@ -1,4 +1,4 @@
-"""MQTT of a cluster: the newest reports of each unit, stored by a listening thread, read by the driver's."""
+"""MQTT of a cluster: the newest reports of each unit, stored by a listening thread, read by the driver's thread."""
 
 import json
 import math
@@ -13,24 +13,24 @@ from hardware.link.mqtt import MqttLink
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.messages import MessageIgnored, OtherClient
 
-KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
-MOST_ML = 100.0  # no event tells more: half a second of a pump, or what a pump gave that stood still
+KEPT, LONGEST = 2000, 100_000  # most readings and events; most bytes of a message
+MOST_ML = 100.0  # an event reports less: half a second of a pump, or the volume of a job that stood still
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
 PUMPS = MEDIA, ALT, WASTE = "add_media", "add_alt_media", "remove_waste"  # jobs, in the order of config.pump_pins
 NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
 SPARE = 3  # number of the alt-media pump
-NUMBERS = {MEDIA: 0, ALT: SPARE, WASTE: 0}  # of spare pumps, as records have them
+NUMBERS = {MEDIA: 0, ALT: SPARE, WASTE: 0}  # numbers of spare pumps in records
 AUTOMATIONS = ("circulate_media", "circulate_alt_media", "pumps", "dosing_automation")  # drive several pumps
 DOSING_JOBS = (*PUMPS, *AUTOMATIONS)
 LIVE = ("init", "ready", "sleeping")
-WORDS = (*LIVE, "disconnected", "lost")  # the last is the broker's: the job was killed, stands still, or left it
-ECHOES = ("stirring", "temperature_automation")  # jobs that say all pins of the unit now and then
+WORDS = (*LIVE, "disconnected", "lost")  # "lost" is sent by the broker: the job was killed, hangs, or lost the broker
+ECHOES = ("stirring", "temperature_automation")  # jobs that repeatedly report all pins of the unit
 CHANNELS = {"1": 17, "2": 13, "3": 16, "4": 12, "5": 18}  # GPIO pin of each PWM channel of the vendor's board
-TWICE_S = 0.2  # two messages that are not of the same instant
+TWICE_S = 0.2  # least time between two separate messages
 
 
 class Reading(NamedTuple):
-    """One OD reading: when it arrived by our clock, the value, whether it is of a calibration and so no voltage."""
+    """One OD reading: time of arrival by this computer's clock, value, and whether it is calibrated (else volts)."""
 
     at: float
     value: float
@@ -38,7 +38,7 @@ class Reading(NamedTuple):
 
 
 class Event(NamedTuple):
-    """One dosing event: pump job, mL (reported before they are pumped), who requested it."""
+    """One dosing event: pump job, mL (reported before they are pumped), and id of the requester."""
 
     pump: str
     ml: float
@@ -46,19 +46,19 @@ class Event(NamedTuple):
 
 
 class State(NamedTuple):
-    """Last state that a job reported, and when; a retained message has unknown age, -inf."""
+    """Last state that a job reported, and the time of the report; -inf if the message was retained."""
 
     word: str = ""
     at: float = -math.inf
 
 
 class Pin:
-    """A pump's pin by the messages about it.
+    """A pump's pin according to the messages about it.
 
-    Attributes: on; on_s, off_s, when it last went on and off, -inf if that is not known; ran_s, for how long it has run
-      up to off_s; inits, when processes of its job began; run_s, ended_s, when one last said that it is there, and that
-      it ended; event_s, when it first told what it is about to give, inf if it did not; doubt_s, when it was said to be
-      on though its job had ended.
+    Attributes: on. on_s, off_s: times at which it last went on and off, -inf if unknown. ran_s: total time on up to
+      off_s. inits: times at which processes of its job began. run_s, ended_s: times at which a process last reported
+      that it runs, and that it ended. event_s: time of the first dosing event of this run of the pump, else inf.
+      doubt_s: time of a report that the pin is on after its job had ended.
     """
 
     def __init__(self) -> None:
@@ -68,9 +68,10 @@ class Pin:
         self.inits = deque[float](maxlen=8)
 
     def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
-        """Take a message that has all pins of the unit, of -inf if it was retained and the pin is on.
+        """Process a report of all pins of the unit. Args: at: its time, -inf if it was retained and the pin is on.
 
-        Where others say pins, too (echoes), they do so late: on without a job (its word) is what is said twice.
+        echoes: other jobs report pins, too, but late. Without a live job (word), on therefore counts only if reported
+        twice.
         """
         if not on:
             self.ends(at)
@@ -84,10 +85,10 @@ class Pin:
             else:
                 self.doubt_s = at if self.doubt_s == -math.inf else self.doubt_s
                 return
-            self.on, self.on_s = True, min(on_s, self.event_s)  # a job that stands still says its pin late
+            self.on, self.on_s = True, min(on_s, self.event_s)  # a job that hangs reports its pin late
 
     def ends(self, at: float) -> None:
-        """End the pin's run; what it ran until then counts once."""
+        """End the pin's run; its time on counts only once."""
         began = self.on_s if self.on else self.event_s
         self.ran_s += at - began if math.isfinite(began) else 0.0
         if self.on or began < math.inf:
@@ -96,14 +97,14 @@ class Pin:
 
 
 class Mailbox:
-    """Reports of one unit; filled by `take`, which may be called from another thread. Times are real seconds.
+    """Reports of one unit; filled by `take`, which another thread may call. Times are real seconds.
 
     A retained message of another experiment has no known time and is ignored.
 
-    Attributes: readings, events and ignored, kinds of messages that were left out, for the driver to take out; jobs,
-      pin number of each pump's job; pins, what is known of each; states, of each job by experiment; temperature,
-      target, of the thermostat, degC; stir_duty, %; heard_s, when the unit last sent anything; dc_s, when it last
-      reported its pins; complaint, why its reader took no reading, by its log.
+    Attributes: readings, events, ignored: readings, dosing events and notes on invalid messages since the last `drain`.
+      jobs: pin number of each pump's job. pins: state of each pin. states: state of each job, by experiment.
+      temperature, target: of the thermostat, degC. stir_duty: %. heard_s: time of the unit's last message. dc_s: time
+      of its last report of pins. complaint: why its OD reader took no reading, from its log.
     """
 
     def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
@@ -122,16 +123,16 @@ class Mailbox:
         self.complaint, self._stamp, self._said = "", "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
-        """Take a message; ignore an invalid one and note its kind once. Raises: nothing."""
+        """Process a message; ignore an invalid message and note its kind once. Raises: nothing."""
         experiment, _, rest = topic.removeprefix(self._root).partition("/")
         try:
             with self.lock:
                 if len(payload) > LONGEST:
                     raise ValueError(f"{len(payload)} bytes")
-                if not (retained or rest.endswith("/set") or payload == b"lost"):  # what others say, or the broker
+                if not (retained or rest.endswith("/set") or payload == b"lost"):  # not from others or the broker
                     self.heard_s = self._clock.now()
                 self._enter(experiment, rest, payload, retained)
-        except Exception as error:  # the thread that calls must go on, whatever somebody sends
+        except Exception as error:  # the calling thread must continue after any message
             kind = rest.rsplit("/", 1)[-1][:40]
             if kind not in self._said and len(self._said) < 100:
                 self._said.add(kind)
@@ -151,9 +152,9 @@ class Mailbox:
             for job, number in self.jobs.items():
                 word = LIVE[0] if self.live(job, *AUTOMATIONS) else self.state(job).word
                 on = duty.get(number, 0.0) > 0.0
-                self.pins[job].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
+                self.pins[job].update(on, at if on else now, word, echoes)  # off by now, even if retained
             self.dc_s = max(self.dc_s, at)
-        elif rest == "dosing_events" and not retained and payload not in self._heard:  # a bridge brings one twice
+        elif rest == "dosing_events" and not retained and payload not in self._heard:  # a bridge may repeat one
             e = json.loads(payload)
             self._heard.append(payload)
             if not isinstance(e["event"], str):
@@ -191,11 +192,11 @@ class Mailbox:
             pin.run_s = at
         elif word == "disconnected":
             pin.ended_s = at
-            if pin.on_s >= pin.run_s or pin.run_s <= pin.event_s < math.inf:  # the word on its pin may be overtaken
+            if pin.on_s >= pin.run_s or pin.run_s <= pin.event_s < math.inf:  # the pin's report may come later
                 pin.ends(at)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
-        """Take a reading; a retained one is the last one of before, and one with the stamp of another is the same."""
+        """Store a reading, unless it was retained (an old reading) or has the timestamp of the last one (a copy)."""
         stamp = str(said["timestamp"])
         if retained or stamp == self._stamp:
             return
@@ -204,14 +205,14 @@ class Mailbox:
         self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:
-        """Forget the states of jobs before they report them again; a pump's job ends with the broker."""
+        """Forget the states of jobs, which report them again; a pump's job ends if it loses the broker."""
         with self.lock:
             self.states.clear()
             for pin in self.pins.values():
                 pin.event_s = math.inf
 
     def drain(self) -> tuple[list[Reading], list[Event], list[MessageIgnored]]:
-        """Return readings, events, and what was ignored, since the last call."""
+        """Return the readings, events and notes on ignored messages since the last call."""
         with self.lock:
             found = list(self.readings), list(self.events), list(self.ignored)
             for kind in (self.readings, self.events, self.ignored):
@@ -222,7 +223,7 @@ class Mailbox:
         return self.states.get((self._experiment, job), State())
 
     def live(self, *jobs: str) -> bool:
-        """Whether a job of these names is there: in our experiment, or heard of in another one since we listen."""
+        """Return whether one of these jobs runs, in this experiment or by a live report in another experiment."""
         with self.lock:
             known = [(s, e == self._experiment) for (e, name), s in self.states.items() if name in jobs]
         return any(s.word in LIVE and (mine or s.at > -math.inf) for s, mine in known)
@@ -232,7 +233,7 @@ class Mailbox:
 
 
 def _number(said: Any) -> float:
-    """Convert to a finite number, of text too. Raises: TypeError, ValueError, OverflowError."""
+    """Convert a number or text to a finite number. Raises: TypeError, ValueError, OverflowError."""
     value = float(said) if isinstance(said, int | float | str | bytes) and not isinstance(said, bool) else math.nan
     if not math.isfinite(value):
         raise ValueError(f"no number: {str(said)[:40]!r}")
@@ -240,7 +241,7 @@ def _number(said: Any) -> float:
 
 
 class Cluster(MqttLink):
-    """The connection to the broker of some units, and who else controls them. Raises: LinkError."""
+    """Connection to the broker of some units, and locks against other clients of these units. Raises: LinkError."""
 
     def __init__(self, config: PioreactorConfig, boxes: dict[str, Mailbox], name: str, clock: Clock) -> None:
         self._boxes, self._lock, self._others = boxes, LOCKS + name, dict[str, dict[str, Any]]()
@@ -266,7 +267,7 @@ class Cluster(MqttLink):
             self._boxes[unit].take(topic, payload, retained)
 
     def hold(self) -> None:
-        """Announce to other clients of this cluster that this program controls these units while connected."""
+        """Announce to the cluster's other clients that this program controls these units while it is connected."""
         self.keep(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)}))
 
     def holder(self, unit: str) -> OtherClient | None:

@@ -1,4 +1,4 @@
-"""Before a run: one line per check, passed or with the remedy. Of a unit it switches stirring, and nothing else."""
+"""Checks before a run: one line each, passed or with a remedy. They switch a unit's stirring, and nothing else."""
 
 import math
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ QUEUE_S = 20.0
 
 
 def preflight(reactors: PioreactorReactors) -> list[Check]:
-    """Check the broker, then per unit what a run needs of it. Raises: nothing about a unit."""
+    """Check the broker, then everything that a run needs of each unit. Raises: nothing about a unit."""
     try:
         reactors.connect()
         checks = [Check("broker", True, f"{reactors.config.broker} lets {reactors.config.username} in")]
@@ -39,8 +39,8 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
     who = str(health.get("pioreactor_unit"))
     yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")
     version = str(web.get("/versions/app").get("version"))
-    asked = "" if version in TESTED else "; asked of it all the same: its jobs, calibrations, settings, task queue"
-    yield Check(f"{name} version", version in TESTED, version, f"tried with {', '.join(TESTED)}{asked}", required=False)
+    asked = "" if version in TESTED else "; the checks of jobs, calibrations, settings and task queue still count"
+    yield Check(f"{name} version", version in TESTED, version, f"tested: {', '.join(TESTED)}{asked}", required=False)
     yield (experiment := _experiment(name, config.experiment, unit.leader))
     calibrations = web.get("/active_calibrations")
     names = [NAMES[job] for job in station.doses.pumps.jobs]
@@ -51,52 +51,52 @@ def _unit(station: PioreactorStation, reactors: PioreactorReactors) -> Iterator[
             yield Check(f"{name} {pump}", False, error.sentence, error.remedy)
     try:
         settings = web.get("/config/merged")
-    except NotHeard:  # an older version, of which the leader knows
+    except NotHeard:  # an older version, whose settings the leader has
         settings = unit.leader.get(f"/workers/{name}/configuration", below="/api").get(name)
     settings = settings if isinstance(settings, dict) else {}
     norm = str(settings.get("od_reading.config", {}).get("ref_normalization", "classic"))
     scaled = norm == "classic" or config.od_scale != 1.0 or any(device.startswith("od") for device in calibrations)
-    remedy = "calibrate OD, give backend.od_scale, or set it to classic in the vendor's page"
+    remedy = "calibrate OD, set backend.od_scale, or set ref_normalization to classic in the vendor's page"
     yield Check(f"{name} scale", scaled, f"ref_normalization = {norm}", remedy)
     eyes = {k: v for k, v in settings.get("od_config.photodiode_channel", {}).items() if v not in ("", "REF")}
     sees = ", ".join(f"{k} at {v} degrees" for k, v in eyes.items()) or "none"
-    remedy = f"allowed backend.channel or backend.units.{name}.channel one of these, or set it in the vendor's page"
+    remedy = f"set backend.channel or backend.units.{name}.channel to one of these, or correct the vendor's page"
     yield Check(f"{name} photodiode", config.channel in eyes, f"{config.channel} of {sees}", remedy)
     wired = {pump: CHANNELS.get(channel) for channel, pump in settings.get("PWM", {}).items()}
     pins = dict(zip(NAMES.values(), config.pump_pins, strict=True))
     seen = ", ".join(f"{pump} at {wired.get(pump)} (backend.pump_pins: {pins[pump]})" for pump in names)
     same = all(wired.get(pump) == pins[pump] for pump in names)
-    yield Check(f"{name} wiring", same, seen, "give backend.pump_pins, or correct the section PWM in the vendor's page")
+    yield Check(f"{name} wiring", same, seen, "set backend.pump_pins, or correct the section PWM in the vendor's page")
     tube = str(settings.get("bioreactor", {}).get(facts(version).tube, "not set"))
-    remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"
+    remedy = "set both to the culture's volume at its efflux tube: the unit refuses doses by its own setting"
     same = tube == "not set" or abs(float(tube) - unit.volume_ml) <= 0.5
     yield Check(f"{name} volume", same, f"{tube} mL in its settings, {unit.volume_ml:g} here", remedy, required=False)
     other = reactors.mqtt.holder(name)
-    seen = other.sentence if other else "no other client of ours"
+    seen = other.sentence if other else "no other client"
     yield Check(f"{name} client", not other, seen, other.remedy if other else "")
     dosing = sorted({str(job["job_name"]) for job in web.running()} & set(DOSING_JOBS))
     forget = facts(version).forget
     word = f"on the unit {forget} --job-name {dosing[0]}" if forget and dosing else "the unit is rebooted"
-    remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
-    yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
+    remedy = f"stop it in the vendor's page; a killed job stays in the list until {word}"
+    yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "no dosing job runs", remedy)
     clock = RealClock()
     barrier = Barrier(web, clock)  # a request that only prints help
     while not (passed := barrier.passed()) and clock.now() < QUEUE_S:
         clock.sleep(STEP_S)
-    seen = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
+    seen = "responds" if passed else f"no response in {QUEUE_S:.0f} s"
     yield Check(f"{name} task queue", passed, seen, "on the unit: sudo systemctl restart huey")
-    if experiment.ok:  # of another one it tells us nothing
+    if experiment.ok:  # in another experiment the unit does not report its pins
         for _ in station.hear_pins():
             unit.real.sleep(STEP_S)
-        heard, remedy = unit.box.dc_s > -math.inf, f"tried with {', '.join(TESTED)}; look whether stirring runs"
-        yield Check(f"{name} pins", heard, "told when one is switched" if heard else PinsUntold.says, remedy)
+        heard, remedy = unit.box.dc_s > -math.inf, f"tested: {', '.join(TESTED)}; check that stirring runs"
+        yield Check(f"{name} pins", heard, "reported when switched" if heard else PinsUntold.says, remedy)
 
 
 def _experiment(name: str, wanted: str, leader: Web) -> Check:
-    """Whether the unit is in the experiment that its jobs are to run in: the vendor shows nothing of another."""
-    remedy = "give backend.experiment=NAME of the one it is in, or assign it, active, in the vendor's page"
+    """Check that the unit is in the run's experiment, because it reports nothing of another experiment."""
+    remedy = "set backend.experiment=NAME, or assign the unit, active, in the vendor's page"
     try:
         why = leader.astray(name)
     except NotHeard as error:
-        return Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
+        return Check(f"{name} experiment", False, str(error), "set backend.leader=http://HOST", required=False)
     return Check(f"{name} experiment", not why, f"{why or 'active'}, backend.experiment = {wanted}", remedy)

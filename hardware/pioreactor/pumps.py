@@ -1,8 +1,8 @@
-"""The pump jobs of one unit: asked for once, followed to their end, and ended where they do not end by themselves.
+"""The pump jobs of one unit: each is requested once, followed to its end, and stopped if it does not end.
 
-The vendor's 202 says only that a request was written down. A job has begun when an event with its id arrives or its pin
-goes on, and is over when it has said so and its pin is off. Every other course leads into one routine, `Pumps.end`.
-Times here are real seconds.
+The vendor's reply 202 means only that the request was stored. A job has begun when an event with its id arrives or its
+pin goes on. It has ended when it has reported its end and its pin is off. In all other cases `Pumps.end` stops the
+pump. Times here are real seconds.
 """
 
 import math
@@ -29,30 +29,30 @@ T = TypeVar("T")
 
 OURS = "turbidostat/"
 STEP_S = 0.1
-SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
-OVERRUN_S = 3.0  # beyond its time a job is given to end by itself
-UNSTARTED_S = 60.0  # that a process may take from the queue to its first word, on a busy unit
-QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
-LATE_ML = 0.1  # messages are late by some hundredths of a second
-ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
-PAST_S = 0.5  # beyond its dose a media pump that is told on is drained
-PROOF_S = 20.0  # with a broker, in which a pump is proven off, or a hand must look at it
-NUDGE = 0.01  # of a duty, %: nobody sees it
-SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
-AGAIN_S = 15.0  # between two of them
-UNTOLD = 2  # runs in a row of which no pin was told; with one more no pump is followed
+SETTLE_S = 1.5  # longest delay of a report; the events of a dose are 0.5 s apart
+OVERRUN_S = 3.0  # time beyond its dose after which a job is stopped
+UNSTARTED_S = 60.0  # longest time of a process from the queue to its first report, on a busy unit
+QUIET_S = 10.0  # a live unit reports more often, because it reads OD
+LATE_ML = 0.1  # tolerance of volumes, because messages are late by some hundredths of a second
+ROUNDED_S = 0.5  # a job reports its dose in parts of this length, each before it is pumped
+PAST_S = 0.5  # time beyond its dose after which a media pump that is reported on is drained
+PROOF_S = 20.0  # with a broker, time for the proof that a pump is off; then a user must look
+NUDGE = 0.01  # change of the stirring duty, %, too small to matter
+SHORT_S, SHORTS = 0.1, 3  # duration of a short run, which ends with the pin off; most short runs
+AGAIN_S = 15.0  # between two short runs
+UNTOLD = 2  # most runs in a row without a report of the pin
 
 Steps = Generator[float, None, T]
-"""A course that yields what to wait, s, and returns T."""
+"""A generator that yields pauses, s, and returns T."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit's surroundings.
+    """One unit with its connections.
 
-    name: as in the vendor's page. config: of this unit. bench: period, bottle. volume_ml: of its culture. web, leader,
-    mqtt, box: the ways to it and to its leader. clock: of the run, whose `real` is that of messages and jobs. book:
-    what it reports. run: of this run, part of every dose's id.
+    name: name in the vendor's page. config: config of this unit. bench: period, bottle. volume_ml: of its culture, mL.
+    web, leader, mqtt, box: connections to the unit and its leader. clock: clock of the run, whose `real` is the clock
+    of messages and jobs. book: the unit's logbook. run: id of this run, part of every dose's id.
     """
 
     name: str
@@ -72,12 +72,12 @@ class Unit:
         return self.clock.real
 
     def say(self, topic: str, payload: str) -> None:
-        """Publish below our experiment."""
+        """Publish a message to the unit in this run's experiment."""
         self.mqtt.publish(f"pioreactor/{self.name}/{self.config.experiment}/{topic}", payload)
 
 
 class Moved(NamedTuple):
-    """What a pump moved, mL, at least and at most; end, what is not as asked, or None."""
+    """Smallest and largest volume that a pump moved, mL. end: a note if it is not as requested, else None."""
 
     low: float = 0.0
     high: float = 0.0
@@ -85,7 +85,7 @@ class Moved(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A run of a pump that was asked for (ml), or found (0): its id, when that was, its pin's time then, the answer."""
+    """A requested run of a pump, or one that was found (ml 0). asked_s: its time. ran_s: total time of the pin then."""
 
     job: str
     ml: float
@@ -96,26 +96,26 @@ class Request(NamedTuple):
 
 
 def boot_of(rows: list[dict[str, Any]]) -> str:
-    """When a unit was started, by its list of running jobs; "" where that does not say it."""
+    """Return when a unit was started, from its list of running jobs; "" if the list does not have it."""
     return next((str(row.get("started_at", "")) for row in rows if row["job_name"] == "monitor"), "")
 
 
 class Pumps:
     """The pumps of one unit.
 
-    Attributes: jobs, of those that this run drives; ours, how every id of this run begins; short, that of a run that
-      only ends with its pin off; flow_ml_s, by the active calibrations; reported, mL by job and source of the events;
-      counted, mL of them that whoever asked for them books, inf while they are under way; facts, of the unit's version;
-      boot, when it was started; proven, when pumps were ended here; trouble, why no dose may be given, None if one may;
-      barred, jobs that are to end; waits, whether what is under way waits for somebody or something else; flowed_ml,
-      the most that a media pump gave up to now that is not proven off, and runs_on, whether it is to be drained.
+    Attributes: jobs: pump jobs that this run uses. ours: prefix of every id of this run. short: id of short runs, which
+      only switch a pin off. flow_ml_s: by job, from the active calibrations. reported: mL by job and source of events.
+      counted: mL by job and source that are booked with a dose, inf while it is under way. facts: facts on the unit's
+      version. boot: when the unit was started. proven: times at which `end` proved pumps off. trouble: fault against
+      any dose, or None. barred: jobs that must end. waits: the current dose waits for something outside. flowed_ml:
+      largest volume so far of a media pump that is not proven off. runs_on: this pump must be drained.
     """
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.web, self.mqtt, self.box = unit, unit.web, unit.mqtt, unit.box
         self.config, self.clock, self.book, self.pins = unit.config, unit.real, unit.book, unit.box.pins
         self.jobs = PUMPS if unit.config.alt_media else (MEDIA, WASTE)
-        self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # about what the vendor's pumps give, until it was read
+        self.flow_ml_s = dict.fromkeys(self.jobs, 1.0)  # until the calibrations are read
         self.reported = defaultdict[tuple[str, str], float](float)
         self.counted = defaultdict[tuple[str, str], float](float)
         self.facts, self.boot = Facts(), ""
@@ -128,7 +128,7 @@ class Pumps:
         self.short = f"{self.ours}{unit.name}/off"
 
     def odd(self, job: str) -> bool:
-        """Whether a pump has to be ended: it runs without a job, or its job was lost and it is not proven off since."""
+        """Return whether a pump must be ended: it runs without a job, or its job was lost and it is not proven off."""
         pin, state, now = self.pins[job], self.box.state(job), self.clock.now()
         settled = now > max(pin.on_s, pin.ended_s) + SETTLE_S
         new = state.at > self.proven.get(job, -math.inf) or job not in self.proven
@@ -138,12 +138,12 @@ class Pumps:
         return boot_of(rows) not in ("", self.boot)
 
     def told_on(self, job: str) -> bool:
-        """Return whether the unit reports a pump on since the broker is connected, except by a short run."""
+        """Return whether the unit has reported a pump on since the broker connected, except for a short run."""
         pin, broke_s, before_s = self.pins[job], self.mqtt.broke_s, self.clock.now() - SETTLE_S
         return pin.on and pin.on_s < before_s and (broke_s <= pin.on_s or broke_s < self.box.dc_s < before_s)
 
     def ask_pins(self) -> None:
-        """Have stirring report all pins again: change its duty a little, as newer versions report only changes."""
+        """Make stirring report all pins: change its duty slightly, because newer versions report only changes."""
         if not math.isnan(duty := self.box.stir_duty):
             self.unit.say("stirring/duty_cycle/set", f"{duty + NUDGE * (-1) ** round(duty / NUDGE):g}")
 
@@ -151,19 +151,19 @@ class Pumps:
         return self.reported[request.job, request.dose]
 
     def answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
-        """Wait for a request while the other units go on. Raises: as the request."""
+        """Wait for the answer to a request, in steps. Raises: as the request."""
         future = self.web.ask(what, *given)
         while not future.done():
             yield STEP_S
         return future.result()
 
     def calibrate(self) -> Steps[None]:
-        """Read what each pump gives by its calibration now. Raises: ReactorError."""
+        """Read the flow of each pump from its active calibration. Raises: ReactorError."""
         said = yield from self.answer(self.web.get, "/active_calibrations")
         self.flow_ml_s = {job: flow(said, f"{NAMES[job]}_pump") for job in self.jobs}
 
     def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
-        """Ask for one pump job and follow it; what it gave. It is never asked for again."""
+        """Request one pump job, once, and follow it; return the volume that it gave."""
         try:
             yield from self.calibrate()
             if not self.mqtt.connected:
@@ -186,7 +186,7 @@ class Pumps:
         return moved
 
     def follow(self, request: Request) -> Steps[Moved]:
-        """Follow a job to its end; return what it gave."""
+        """Follow a job to its end; return the volume that it gave."""
         job = request.job
         if why := (yield from self._begins(request)):
             return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
@@ -200,11 +200,11 @@ class Pumps:
         self.runs_on = False
         self._untold = 0 if self.pins[job].on_s >= request.asked_s else self._untold + 1
         if self._untold > UNTOLD:
-            self.box.dc_s = -math.inf  # until the unit tells its pins again
+            self.box.dc_s = -math.inf  # until the unit reports its pins again
         return self._moved(request)
 
     def _beyond(self, request: Request) -> float:
-        """Return what a pump gave that is on past the end of its dose, mL; 0 before that, or while nothing is heard."""
+        """Return the volume of a pump that is on past the end of its dose, mL; 0 if it is not, or without reports."""
         pin, flow, now = self.pins[request.job], self.flow_ml_s[request.job], self.clock.now()
         on_s = max(pin.on_s, request.asked_s)
         end_s = on_s + request.ml / flow
@@ -215,15 +215,15 @@ class Pumps:
         return (now - on_s) * flow if self.box.heard_s > end_s else 0.0
 
     def broke(self, request: Request) -> bool:
-        """Whether the connection to the broker was lost since a run was asked for."""
+        """Return whether the connection to the broker was lost after the request."""
         return self.mqtt.broke_s >= request.asked_s
 
     def _begins(self, request: Request) -> Steps[Message | None]:
-        """Wait until a request's pump begins, then None; or until it certainly never will, then why (as below)."""
+        """Wait until the pump of a request begins (return None) or certainly never will (return the reason)."""
         job, asked_s = request.job, request.asked_s
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
         why: Message | None = None
-        never_s, late = math.inf, False  # from when on it cannot begin any more; whether it should have begun
+        never_s, late = math.inf, False  # time after which it cannot begin; whether it should have begun
         fate = messages.FateUnknown(ml=request.ml, job=job)
         while not (
             why or self.said(request) > 0.0 or self.pins[job].on or self.pins[job].on_s >= asked_s
@@ -247,7 +247,7 @@ class Pumps:
                 why = messages.NotCarriedOut(purge=self.facts.purge, pin=self.box.jobs[job])
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = messages.ForgottenByRestart()
-            if job in self.barred and calls.due("stop", 1.0):  # heard once the job listens
+            if job in self.barred and calls.due("stop", 1.0):  # works once the job listens
                 self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late:
@@ -257,42 +257,42 @@ class Pumps:
         return why
 
     def last_word(self, request: Request) -> str:
-        """Return the last state that the job reported; "" is unknown: two processes share a topic, or it broke."""
+        """Return the last state that the job reported; "" if unknown: two processes, or the connection was lost."""
         pin, state = self.pins[request.job], self.box.state(request.job)
         alone = sum(at >= request.asked_s for at in pin.inits) <= 1 and not self.broke(request)
         return state.word if request.ml > 0.0 and alone and state.at >= request.asked_s else ""
 
     def _is_over(self, request: Request) -> bool:
-        """Return whether a job reported its end, its pin is still, and its last event is there or will not come."""
+        """Return whether a job reported its end, its pin is off, and its last event has come or will not come."""
         state, pin, asked_s = self.box.state(request.job), self.pins[request.job], request.asked_s
-        told = pin.on_s >= asked_s and state.word == "disconnected" and state.at >= asked_s  # whoever's word that was
+        told = pin.on_s >= asked_s and state.word == "disconnected" and state.at >= asked_s  # of any process
         ended = (told or self.last_word(request) == "disconnected") and not pin.on
         return ended and (self.said(request) >= request.ml - 1e-6 or self.clock.now() > state.at + SETTLE_S)
 
     def _moved(self, request: Request) -> Moved:
-        """Return what a job that ended by itself gave, by its events and by how long its pin was on."""
+        """Return the volume of a job that ended normally, from its events and its pin's time on."""
         flow, ml, said_ml = self.flow_ml_s[request.job], request.ml, self.said(request)
         end: Message | None = None
         low = high = said_ml
         ran_ml = (self.pins[request.job].ran_s - request.ran_s) * flow
-        if said_ml < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
+        if said_ml < ml - 1e-6:  # a stop by HTTP reports up to 0.5 s too much; an event may be missing
             slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * flow
             low, high = max(min(said_ml, ran_ml or said_ml) - slack, 0.0), min(max(said_ml, ran_ml) + slack, ml)
             end = messages.ToldLess(told_ml=said_ml, ml=ml)
         if ran_ml > high + LATE_ML:
             end = end or messages.RanLonger(ran_ml=ran_ml, told_ml=said_ml)
-        return Moved(low, max(high, round(ran_ml, 4)), end)  # a job times itself, and on a busy unit it does that late
+        return Moved(low, max(high, round(ran_ml, 4)), end)  # on a busy unit a job ends late
 
     def end(self, request: Request) -> Steps[Moved]:
-        """End a pump that has begun, or may have, until it is proven off; return what it moved."""
+        """Stop a pump that has begun, or may have begun, until it is proven off; return the volume that it moved."""
         job, ending, pin = request.job, ForcedEnd(self, request), self.pins[request.job]
         while math.isnan(off_s := ending.off_s()):
             ending.act()
             late = (now := self.clock.now()) > ending.began + OVERRUN_S
-            heard = self.box.heard_s > max(ending.began, now - QUIET_S)  # else a unit or its broker stands still
+            heard = self.box.heard_s > max(ending.began, now - QUIET_S)  # else the unit or its broker hangs
             if late:
                 ended = "which lost the broker" if self.broke(request) else "which should have ended"
-                how = "whose process was killed or stands still" if ending.lost else ended
+                how = "whose process was killed or hangs" if ending.lost else ended
                 seen = {"pump": NAMES[job], "pin": self.box.jobs[job], "job": job, "how": how}
                 if heard and self.told_on(job):
                     self.trouble = messages.RunsOn(**seen, purge=self.facts.purge)
@@ -312,20 +312,20 @@ class Pumps:
 
 
 class Seen(NamedTuple):
-    """What is known of a pump that is to be off."""
+    """Evidence about a pump that should be off."""
 
     boot: bool  # its unit was started since
-    pin: str  # "on" or "off" as told since, "" untold
-    short: str  # of a run to switch it off: "", "asked", or "ended" by its own event and its job's word after it
-    word: str  # as of `last_word`
+    pin: str  # "on" or "off" as reported since, "" without a report
+    short: str  # of a short run: "", "asked", or "ended" by its own event and a later report of its job
+    word: str  # as `last_word`
 
 
 PROOFS: tuple[dict[str, tuple[Any, ...]], ...] = (
-    {"boot": (True,)},  # which sets all pins to 0
-    {"short": ("ended",), "pin": ("off", "")},  # it set the pin to 0 as it began and as it ended
-    {"short": ("",), "word": ("disconnected",), "pin": ("off",)},  # later words may be those of the short run
+    {"boot": (True,)},  # a boot sets all pins to 0
+    {"short": ("ended",), "pin": ("off", "")},  # a short run sets the pin to 0 at its begin and its end
+    {"short": ("",), "word": ("disconnected",), "pin": ("off",)},  # later reports may be of the short run
 )
-"""What proves a pump off: each of a row's values is among those that it names."""
+"""Proofs that a pump is off: a row holds if each of its keys has one of the listed values."""
 
 
 def is_off(seen: Seen) -> bool:
@@ -333,9 +333,9 @@ def is_off(seen: Seen) -> bool:
 
 
 class ForcedEnd:
-    """One pump on its way to being proven off: what is tried, and what proves it (docs/pioreactor.md, Ending).
+    """Attempts to switch one pump off until it is proven off (docs/pioreactor.md, Ending).
 
-    Of short runs at most `SHORTS` are carried out, and none is asked for while an earlier one may still wait.
+    At most `SHORTS` short runs are carried out; none is requested while an earlier one may still wait.
     """
 
     def __init__(self, pumps: Pumps, request: Request) -> None:
@@ -354,7 +354,7 @@ class ForcedEnd:
         return self._p.reported[self._job, self._p.short]
 
     def act(self) -> None:
-        """Ask what is due; a job that is there is given some seconds to end by itself."""
+        """Send the requests that are due; a running job first has some seconds to end."""
         p, job, passed, calls = self._p, self._job, self._p.clock.now() - self.began, self._calls
         self._apart_s = self._apart_s if p.mqtt.connected and not p.told_on(job) else p.clock.now()
         if calls.due("mqtt", 1.0):
@@ -368,7 +368,7 @@ class ForcedEnd:
                 self._barrier = Barrier(p.web, p.clock, AGAIN_S)
             self._short = None
         may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
-        may_run = may_run and p.mqtt.connected and self._short is None  # what it tells, else it runs unseen
+        may_run = may_run and p.mqtt.connected and self._short is None  # without a broker its reports are lost
         soon = not (p.box.live(job) or p.pins[job].on or self._request.ml > 0.0)
         if may_run and (soon or passed > 5.0) and self._barrier.passed() and calls.due("short", 2.0):
             self._short_s = min(self._short_s, p.clock.now())
@@ -376,7 +376,7 @@ class ForcedEnd:
 
     def _look(self) -> Seen:
         p, pin, state = self._p, self._p.pins[self._job], self._p.box.state(self._job)
-        self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker takes live ones too
+        self.lost = self.lost or (state.word == "lost" and not p.broke(self._request))  # a broker also loses live jobs
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
         if p.clock.now() > p.box.heard_s + QUIET_S:
             self._quiet_s = min(self._quiet_s, p.box.heard_s)
@@ -394,30 +394,30 @@ class ForcedEnd:
 
     @property
     def failed(self) -> bool:
-        """Whether no proof came: a short run found a lock, or it takes too long."""
+        """Whether the proof failed: a short run found a lock, or it takes too long."""
         now, state = self._p.clock.now(), self._p.box.state(self._job)
         refused = state.word == "disconnected" and self._short_s < state.at < now - SETTLE_S
         return now > self._apart_s + PROOF_S or (refused and self._shorts() == self._shorts_before)
 
     def off_s(self) -> float:
-        """When the pump was off at the latest, nan while that is not proven."""
+        """Return the latest time at which the pump can have gone off, nan while it is not proven off."""
         pin, now = self._p.pins[self._job], self._p.clock.now()
         if not is_off(self._look()):
             return math.nan
-        if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
+        if self._rebooted:  # its pins are 0 since it lost its power, which was after its last message
             pin.ends(booted_s := max(min(self._quiet_s, now), self._since))
             if self._untold:
-                return booted_s  # whoever told it off before did not know that it was on
+                return booted_s  # an earlier report of off did not know that it was on
         return pin.off_s if pin.off_s >= self._since else now
 
     @property
     def _untold(self) -> bool:
-        """Whether the pin of a dose that had to be ended was not said to be on: its job switches first."""
+        """Whether the pin of a dose may have been on without a report, because a job switches before it reports."""
         heard = self._since <= self._p.pins[self._job].on_s < self._short_s
         return self._request.ml > 0.0 and not heard and self._p.last_word(self._request) != "disconnected"
 
     def flowed(self) -> float:
-        """Return the volume so far of a pump that runs on or reported no end, mL; 0 once its bottle is empty."""
+        """Return the volume so far of a pump that is not proven off, mL; 0 once its bottle must be empty."""
         p, pin, now = self._p, self._p.pins[self._job], self._p.clock.now()
         broke = p.broke(self._request) and not self.lost
         began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
@@ -425,19 +425,19 @@ class ForcedEnd:
         return flowed if not broke and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
-        """Return what the pump moved since it was asked. Args: off_s: as of `off_s`."""
+        """Return the volume that the pump moved since the request. Args: off_s: result of `off_s`."""
         p, pin, flow = self._p, self._p.pins[self._job], self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
         longest = min(max(min(off_s, self._still_s) - self._from_s, 0.0) * flow, p.unit.bench.bottle_ml)
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
-        if self._held or self._untold or (ran <= 0.0 and self.lost):  # since when it runs was never heard
+        if self._held or self._untold or (ran <= 0.0 and self.lost):  # its start was never reported
             ran = longest
         low, end = max(said_ml - ROUNDED_S * flow, 0.0), messages.EndedFromHere()
-        if ran <= 0.0:  # its pin was never seen: a job times itself
+        if ran <= 0.0:  # its pin was never reported, so the job's own time counts
             return Moved(low, max(ml, said_ml), end)
         if self._rebooted:
             most = max(ran, min(ml, ran + p.config.reading_s * flow))
             return Moved(low, most, messages.StartedAgainInDose())
-        if p.broke(self._request) and not self.lost:  # a job that loses the broker ends; when was not heard
+        if p.broke(self._request) and not self.lost:  # it ends with the broker, unreported
             ran = min(ran, max(ml, said_ml))
         return Moved(low, max(ran, said_ml), end)

@@ -1,4 +1,4 @@
-"""Pioreactors as a `Reactor`: one dose per fresh sample by the vendor's own pump jobs, one to many units."""
+"""Pioreactors as a `Reactor`: one dose per fresh sample by the vendor's pump jobs, for any number of units."""
 
 import logging
 import time
@@ -17,7 +17,7 @@ from hardware.pioreactor.station import PioreactorStation
 from hardware.pioreactor.web import Web
 from hardware.stations import Stations
 
-LOOK_S, FIRST_S = 0.05, 30.0  # real seconds between two looks; until the broker answered
+LOOK_S, FIRST_S = 0.05, 30.0  # real seconds: between two looks; longest wait for the broker
 
 screen = logging.getLogger(__name__)
 
@@ -25,8 +25,8 @@ screen = logging.getLogger(__name__)
 class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
     """Units of one cluster; `close` after `stop`.
 
-    Args: config: units and how to reach them. real: clock of messages and jobs; the run's is `config.speed` times as
-      fast. run: of this run, part of every dose's id; the same after a resume. bench: period, volumes, bottle.
+    Args: config: units and how to reach them. real: clock of messages and jobs; the run's clock is `config.speed` times
+      as fast. run: id of this run, part of every dose's id; a resume keeps it. bench: period, volumes, bottle.
     Raises: LinkError if the broker does not answer.
     """
 
@@ -64,7 +64,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
             station.postpone_start(error, past[station])
 
     def connect(self) -> None:
-        """Wait for the broker to let us in, and for what it retains. Raises: LinkError."""
+        """Wait until the broker accepts this client, and for its retained messages. Raises: LinkError."""
         deadline = self._real.now() + FIRST_S
         while not self.mqtt.connected:
             if self._real.now() > deadline or self.mqtt.refusal:
@@ -79,7 +79,7 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
     def _all(
         self, stations: Sequence[PioreactorStation], action: Callable[[PioreactorStation], Iterator[float]]
     ) -> dict[PioreactorStation, ReactorError]:
-        """Go through the stations' courses side by side, while the other units go on; what failed."""
+        """Run the steps of the actions in parallel, while the other units continue; return the errors."""
         courses, failed = {station: action(station) for station in stations}, dict[PioreactorStation, ReactorError]()
         while courses:
             for station, course in list(courses.items()):
@@ -97,11 +97,11 @@ class PioreactorReactors(Stations[PioreactorStation, UnitHistory]):
         return failed
 
     def _silence(self, stations: Sequence[PioreactorStation]) -> dict[PioreactorStation, ReactorError]:
-        """All pumps of these off, what empties a vial too; what could not be verified."""
+        """Switch all pumps of `stations` off, waste pumps too; return the errors of those that failed."""
         return self._all(stations, lambda station: station.pumps_off(self.config.stop_s, final=True))
 
     def set_level(self, n: int, level_ml: float) -> None:
-        """Put the unit's own ledger, where it keeps one, to a volume, as soon as it answers."""
+        """Set the unit's own ledger, if it keeps one, to a volume as soon as the unit answers."""
         self.stations[n].level_ml = level_ml
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""From the vendor's readings to one sample per control period: the median of those that no dose disturbed."""
+"""From the vendor's readings to one sample per control period: the median of the readings without a dose."""
 
 import math
 from collections import deque
@@ -9,16 +9,16 @@ from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Reading
 from hardware.stations import Newest
 
-FEWEST = 2  # readings of a sample
-DARK = 5.0  # counts, below which the interlock calls a light sensor failed
-COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt
+FEWEST = 2  # least readings of a sample
+DARK = 5.0  # counts below which a light sensor has failed, for the interlock
+COUNTS = 10_000.0  # counts per volt, for the interlock
 
 
 class UnitSampling(Newest):
     """Readings of one unit, and its newest sample.
 
-    Attributes: od, spread, of the sample: median of its readings and robust sd of that; number, of readings; at, clock
-      time of their middle; count, of samples; read_s, clock time of the newest reading.
+    Attributes: od, spread: median of the sample's readings, and its robust sd. number: number of readings. at: mean
+      clock time of the readings. count: number of samples so far. read_s: clock time of the newest reading.
     """
 
     def __init__(self, config: PioreactorConfig, period_s: float, now: float) -> None:
@@ -32,7 +32,7 @@ class UnitSampling(Newest):
         self.read_s = readings[-1].at if readings else self.read_s
 
     def look(self, now: float, undisturbed_s: float) -> bool:
-        """Make the sample that is due, if one is and has readings, which count from undisturbed_s; whether it did."""
+        """Make a sample if it is due, from readings since undisturbed_s; return whether there is a new one."""
         begin = max(undisturbed_s, now - self._config.window_s)
         used = [r for r in self._readings if r.at >= begin] if now >= self._due else []
         if len(used) < FEWEST:
@@ -40,7 +40,7 @@ class UnitSampling(Newest):
         values = np.array([r.value for r in used])
         middle = float(np.median(values))
         spread = 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(len(used))
-        dark = DARK if used[-1].calibrated else 0.0  # of clear medium it may be 0
+        dark = DARK if used[-1].calibrated else 0.0  # a calibrated reading of clear medium may be 0
         self.od, self.spread = (middle - self._config.od_zero) * self._config.od_scale, spread * self._config.od_scale
         self.raw, self.number = min(max(middle * COUNTS, dark), 60_000.0), len(used)
         self.at, self.arrived_s, self.count = float(np.mean([r.at for r in used])), now, self.count + 1

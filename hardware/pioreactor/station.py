@@ -1,7 +1,7 @@
-"""One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it.
+"""One unit: starting and keeping its jobs, its samples, its doses, its faults.
 
-Messages and jobs have real time, samples that of the device, the run's. What takes its time is a course: it yields
-pauses, real seconds, in which the other units go on.
+Messages and jobs have real time; samples have the run's device time. A longer action is a generator: it yields pauses,
+real seconds, in which the other units continue.
 """
 
 import math
@@ -20,18 +20,18 @@ from hardware.pioreactor.versions import AUTOMATION, GONE, HEAT, OD, STIR, facts
 from hardware.pioreactor.web import Barrier, Calls
 from hardware.stations import Plan, Station
 
-GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
-RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
-SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
-SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
-PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
-FRESH = 4.0  # periods of readings in which one that is taken has arrived
+GRACE_S = 20.0  # time in which a requested job may start; pause between two attempts to start a unit
+RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; sends before the job is restarted
+SETTLED_S = 2.0  # time after which a turbidostat with wrong settings has ended
+SILENT_S = 45.0  # time without a reading after which a reader counts as stopped
+PUMPS_S = 10.0  # time to verify pumps off while a run continues
+FRESH = 4.0  # a reader that runs delivers a reading within this many reading periods
 
 
 class PioreactorStation(Station):
     """One unit of a cluster.
 
-    Attributes: level_ml, that the unit's own ledger is to be put to, nan if it is not; up, whether it was brought up.
+    Attributes: level_ml: volume to set in the unit's own ledger, nan if none. up: the unit was started.
     """
 
     def __init__(self, unit: Unit) -> None:
@@ -52,13 +52,13 @@ class PioreactorStation(Station):
         self._target_sent_s, self._target_sends = math.inf, 0
 
     def bring_up(self, history: UnitHistory) -> Iterator[float]:
-        """Version and calibrations read, jobs adopted or started, an open dose looked for. Raises: ReactorError."""
+        """Read version and calibrations, adopt or start jobs, find an open dose's outcome. Raises: ReactorError."""
         self.regulated_od = history.handed_over
         self._pumps.facts = facts(str((yield from self._answer(self._web.get, "/versions/app")).get("version")))
         yield from self._pumps.calibrate()
         rows = yield from self._answer(self._web.running)
         self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
-        if history.boot not in ("", self._pumps.boot):  # which sets all pins to 0
+        if history.boot not in ("", self._pumps.boot):  # a boot sets all pins to 0
             self._pumps.proven = dict.fromkeys(self._pumps.jobs, self._real.now())
         if AUTOMATION in self._listed and not self.handed_over:
             raise messages.AutomationRuns()
@@ -77,7 +77,7 @@ class PioreactorStation(Station):
         self.book.log("device", device_id=self.name, url=url, flows=p.flow_ml_s, boot=p.boot, run=self.unit.run)
         self.book.log("temperature", temperature=self._target)
         yield from () if history.open else self.hear_pins()
-        self.up, self.sampling.arrived_s = True, self._clock.now()  # the first sample is waited for from now on
+        self.up, self.sampling.arrived_s = True, self._clock.now()  # the wait for a sample begins
 
     def hear_pins(self) -> Iterator[float]:
         """Switch the stirring pin until the unit reports it, for at most a minute."""
@@ -93,7 +93,7 @@ class PioreactorStation(Station):
         self._listened = True
 
     def postpone_start(self, error: ReactorError, history: UnitHistory) -> None:
-        """Note that the unit could not be brought up; the run goes on without it and tries again after a while."""
+        """Note that the unit could not be started; the run continues without it and tries again after a pause."""
         self.book.report(messages.NotBroughtUp(error=error))
         self._course = self._rise(history)
 
@@ -132,7 +132,7 @@ class PioreactorStation(Station):
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
                 self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
-            for job in PUMPS:  # a broker that was killed may say again what was retained long before
+            for job in PUMPS:  # a restarted broker may repeat old retained messages
                 old = self._box.live(job) and self._box.state(job).at < self._real.now() - GRACE_S
                 if old and job not in self._listed and not self.doses.running:
                     self._box.take(f"pioreactor/{self.name}/{self._config.experiment}/{job}/$state", b"lost", False)
@@ -151,12 +151,12 @@ class PioreactorStation(Station):
         self._steer()
 
     def poll(self) -> bool:
-        """Go on. True if there is a new sample; the caller must act on it."""
+        """Process reports and tasks; return whether there is a new sample, which the caller must act on."""
         self.go_on()
         if not self.up:
             return False
         undisturbed_s = self._clock.of_real(self.doses.ended_s) + self._config.mix_s
-        dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
+        dosing = self.doses.running and not self._pumps.waits  # an unknown dose may last hours
         is_new, s = not dosing and self.sampling.look(self._clock.now(), undisturbed_s), self.sampling
         s.temperature = c = self._box.temperature
         self.book.report(self._wrong())
@@ -200,7 +200,7 @@ class PioreactorStation(Station):
         return [job for job, it_is in wanted.items() if it_is]
 
     def _there(self, job: str) -> bool:
-        """Whether a job is there: by its own word, which a restarted broker forgets; by its readings; by the list."""
+        """Return whether a job runs: from its readings, from its reported state, else from the unit's list of jobs."""
         longest_s = self._clock.of_real(FRESH * self._config.reading_s)
         if job == OD and (self.sampling.count or self.up):
             silent_s = self._clock.now() - self.sampling.read_s
@@ -209,7 +209,7 @@ class PioreactorStation(Station):
         return self._box.live(job) if self._box.state(job).at > -math.inf else job in self._listed
 
     def _keep(self, job: str) -> None:
-        """Ask for a job again that should run and does not, once if it said itself that it ended."""
+        """Request a job again if it should run and does not; only once if the job reported its own end."""
         if self._there(job):
             self._gone.discard(job)
             self._been.add(job)
@@ -221,7 +221,7 @@ class PioreactorStation(Station):
                 self._ended |= {job} if ended else set()
 
     def _again(self, job: str) -> Iterator[float]:
-        """Start a job anew; one that is there and does nothing is first ended."""
+        """Start a job; if it runs but does nothing, end it first."""
         with suppress(ReactorError):
             yield from self._answer(self._web.stop, job) if self._box.live(job) else self._start(job)
 

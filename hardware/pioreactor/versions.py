@@ -1,4 +1,4 @@
-"""The vendor's software: what differs between its versions, a row per release, and what its jobs are started with."""
+"""The vendor's software: differences between its versions, and the options with which its jobs are started."""
 
 import math
 import re
@@ -13,17 +13,17 @@ OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring",
 Asked = tuple[dict[str, Any], list[list[str]]]
 EXCHANGE_ML = 1.0  # of the vendor's turbidostat
 GONE = {OD: "takes no OD readings", HEAT: "does not heat", STIR: "does not stir", AUTOMATION: "does not regulate"}
-"""What is said of a unit on which a job ended although it should run."""
+"""Text, by job, on a unit whose job ended although it should run."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What a client of one version must know; the defaults are those of 25.11.12.
+    """Facts about one version of the software; the defaults are those of 25.11.12.
 
     curve_struct: a calibration's curve is {type, coefficients}, not a list. purge: command that clears an entry of a
-    cache; forget: that takes a dead job off the list, "" where only a reboot does. target: option, and signal: further
-    ones, of the turbidostat. ledger: the unit keeps the vial's volume, told by MQTT and changed by HTTP, and refuses a
-    dose by it; tube: its name for the level of the efflux tube. What differs in a message is read by its content.
+    cache. forget: command that removes a dead job from the list, "" if only a reboot does. target: the turbidostat's
+    option for its target. signal: its further options. ledger: the unit keeps the vial's volume, reports it by MQTT,
+    changes it by HTTP, and refuses doses by it. tube: setting with the level of the efflux tube.
     """
 
     curve_struct: bool = False
@@ -50,7 +50,7 @@ def number(version: str) -> tuple[int, ...]:
 
 
 def facts(version: str) -> Facts:
-    """Of a version as the unit says it; without a number it is older than all, and a newer one is the last row's."""
+    """Return the facts of a version: all changes up to it apply; a version without a number counts as the oldest."""
     known = Facts()
     for since, changed in CHANGES:
         if number(version) >= number(since):
@@ -59,12 +59,12 @@ def facts(version: str) -> Facts:
 
 
 def target_of(config: PioreactorConfig, facts: Facts, setpoint: float) -> dict[str, Any]:
-    """Build the options of the vendor's turbidostat: a setpoint, OD, as its own reading."""
+    """Build the options of the vendor's turbidostat, with the setpoint, OD, converted to its reading."""
     return {facts.target: setpoint / config.od_scale + config.od_zero, **dict(facts.signal)}
 
 
 def request(job: str, config: PioreactorConfig, facts: Facts, temperature: float, setpoint: float) -> Asked:
-    """Options and overrides of its configuration that a job is asked for with: of thermostat and turbidostat, too."""
+    """Build the options and configuration overrides of a request for a job."""
     if job == OD:
         rate = str(round(1.0 / config.reading_s, 4))
         return {}, [[f"{OD}.config", "samples_per_second", rate], [f"{OD}.config", "smoothing_penalizer", "0"]]
@@ -88,8 +88,8 @@ def regulates(settings: Any, asked: dict[str, Any]) -> bool:
 def flow(calibrations: Any, pump: str) -> float:
     """Return mL per second at the calibrated duty. Raises: NotCalibrated.
 
-    A line is a list [slope, intercept], or in newer versions {type: poly, coefficients: [slope, intercept]}; of other
-    curves the slope is that of the line through 0 that fits what was weighed.
+    A linear curve is a list [slope, intercept], or in newer versions {type: poly, coefficients: [slope, intercept]}.
+    For another curve the slope is that of the line through 0 that fits the weighed data.
     """
     try:
         curve = calibrations[pump]["curve_data_"]

@@ -1,4 +1,4 @@
-"""The vendor's HTTP interface of one unit or leader: what was said, and whether it can have been heard."""
+"""The vendor's HTTP interface of one unit or leader: replies, and whether a failed request can have been received."""
 
 import json
 import math
@@ -18,12 +18,12 @@ from hardware.pioreactor.messages import NotHeard
 
 T = TypeVar("T")
 
-PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused
-OVER = ("complete", "succeeded", "failed")  # states of a task that was taken and is over, in whatever version
+PROBE, PROBE_S = "circulate_media", 30.0  # job requested for its help text only; s between two such requests
+OVER = ("complete", "succeeded", "failed")  # states of a finished task, in all versions
 
 
 class Web:
-    """`/unit_api` of one unit, for an experiment. Requests wait on a thread of their own, one after another."""
+    """`/unit_api` of one unit, for an experiment. `ask` runs requests on a separate thread, one after another."""
 
     def __init__(self, url: str, experiment: str = "", timeout_s: float = 4.0) -> None:
         self.url, self._timeout_s, self._experiment = url, timeout_s, experiment
@@ -33,14 +33,14 @@ class Web:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix=f"web {url}")
 
     def ask(self, what: Callable[..., T], *given: Any) -> "Future[T]":
-        """Begin one of the calls below and wait elsewhere."""
+        """Start one of the calls below on the thread; return its future."""
         return self._pool.submit(what, *given)
 
     def get(self, path: str, below: str = "/unit_api") -> Any:
         return self.send("GET", path, None, below)
 
     def run(self, job: str, options: Mapping[str, Any], overrides: Sequence[Sequence[str]] = ()) -> str:
-        """Ask for a job; returns the task's id. Raises: as `send`."""
+        """Request a job; return the task's id. Raises: as `send`."""
         body = {"options": options, "args": [], "env": self._env, "config_overrides": overrides}
         answer = self.send("POST", f"/jobs/run/job_name/{job}", body)
         if not (isinstance(answer, dict) and isinstance(answer.get("task_id"), str)):
@@ -48,11 +48,11 @@ class Web:
         return str(answer["task_id"])
 
     def stop(self, job: str) -> None:
-        """Ask a job to end; one version reads the query, the other the body. Raises: as `send`."""
+        """Request the end of a job; one version reads the query, another the body. Raises: as `send`."""
         self.send("POST", f"/jobs/stop?job_name={job}", {"job_name": job})
 
     def set_level(self, level_ml: float) -> str:
-        """Put the unit's own ledger of the vial to a volume; why it refuses that, "" if not. Raises: as `send`."""
+        """Set the unit's own ledger of the vial to a volume; return why the unit refuses, or "". Raises: as `send`."""
         path = f"/bioreactor/experiments/{quote(self._experiment, safe='')}"
         try:
             self.send("PATCH", path, {"values": {"current_volume_ml": level_ml}})
@@ -75,7 +75,7 @@ class Web:
         return "" if said.get("is_active", 1) else "the unit is inactive"
 
     def result(self, task: str) -> bool | None:
-        """Whether a task's process may be there; None: it waits, or was asked before. Raises: as `get`."""
+        """Return whether a task's process may run; None: the task waits, or its result was read. Raises: as `get`."""
         try:
             answer = self.get(f"/task_results/{task}")
         except ProtocolError as error:
@@ -89,20 +89,20 @@ class Web:
         return answer["status"] != "failed" and result is not False
 
     def running(self) -> list[dict[str, Any]]:
-        """Get the vendor's list of running jobs, and of killed ones. Raises: LinkError, ProtocolError."""
+        """Get the vendor's list of running jobs; killed jobs stay in it. Raises: LinkError, ProtocolError."""
         jobs = self.get("/jobs/running")
         if not (isinstance(jobs, list) and all(isinstance(job, dict) and "job_name" in job for job in jobs)):
             raise messages.UnknownReply(url=self.url, what=f"{str(jobs)[:60]} is no list of jobs")
         return jobs
 
     def send(self, method: str, path: str, body: Mapping[str, Any] | None, below: str = "/unit_api") -> Any:
-        """Send a request. Raises: NotHeard if it cannot have been carried out; other ReactorError if it may."""
+        """Send a request. Raises: NotHeard if it was certainly not carried out; another ReactorError if it may be."""
         url, content = f"{self.url}{below}{path}", None if body is None else json.dumps(body).encode()
         try:
             status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
         except LinkError as error:
             nobody = isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout)
-            said_so = messages.NobodyReached if nobody else messages.NoReply  # without the remedy of another family
+            said_so = messages.NobodyReached if nobody else messages.NoReply  # with this family's remedy
             raise said_so(error=error.sentence) from error
         try:
             answer = json.loads(said or b"null")
@@ -113,21 +113,21 @@ class Web:
         if status < 300:
             return answer
         reason = answer.get("error", answer) if isinstance(answer, dict) else answer
-        if str(reason).lstrip().startswith("<"):  # a page for people
+        if str(reason).lstrip().startswith("<"):  # a web page
             reason = responses.get(status, "a page")
         failed = messages.TurnedAway if 400 <= status < 500 else messages.ServerFailed
         raise failed(url=url, status=status, reason=" ".join(str(reason).split())[:160])
 
     def close(self) -> None:
-        """Idempotent; a request that hangs is left to its time-out."""
+        """Close the connection; a request that hangs ends by its time-out. Idempotent."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._client.close()
 
 
 class Calls:
-    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often.
+    """HTTP requests without waiting: one of each kind at a time, at a limited rate.
 
-    Attributes: failed, of each kind that was not answered well the last time, since when, and how.
+    Attributes: failed: kinds whose last request failed: time of the first failure, and the error.
     """
 
     def __init__(self, web: Web, clock: Clock) -> None:
@@ -142,7 +142,7 @@ class Calls:
         return due
 
     def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
-        """Return the answer that came since the last call; None while there is none, and for trouble on the way."""
+        """Send a request if it is due; return an answer that came since the last call; None if none, or an error."""
         if kind not in self._open and self.due(kind, every_s):
             self._open[kind] = self._web.ask(what, *given)
         if kind in self._open and self._open[kind].done():
@@ -155,7 +155,7 @@ class Calls:
 
 
 class Barrier:
-    """Whether nothing older waits in the task queue: a harmless request behind it, made now and then, was taken."""
+    """Test that no older request waits in the task queue: a harmless request, sent after it, was processed."""
 
     def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
         self._calls, self._web, self._task = Calls(web, clock), web, ""

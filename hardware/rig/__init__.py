@@ -1,1 +1,1 @@
-"""The vendor's own software around simulated vials, on one computer and without hardware: `python -m` starts it."""
+"""The vendor's software with simulated vials, on one computer and without hardware; `python -m hardware.rig`."""

@@ -1,4 +1,4 @@
-"""`python -m hardware.rig`: the vendor's software around our vials, until Ctrl-C."""
+"""`python -m hardware.rig`: run the vendor's software with simulated vials until Ctrl-C."""
 
 import argparse
 import signal
@@ -16,8 +16,8 @@ def main() -> int:
     program = "python -m hardware.rig"
     usage = f"{program} [--units NAME=ML,...] ...; {program} --help says all"
     parser = argparse.ArgumentParser(prog=program, usage=usage, description=__doc__)
-    parser.add_argument("--units", default="pio01=20,pio02=14", help="NAME=CULTURE_ML of each, separated by commas")
-    parser.add_argument("--growth-x", type=float, default=10.0, help="how much faster than real time cultures grow: 10")
+    parser.add_argument("--units", default="pio01=20,pio02=14", help="NAME=CULTURE_ML of each unit, with commas")
+    parser.add_argument("--growth-x", type=float, default=10.0, help="growth rate over that of real time: 10")
     parser.add_argument("--build-only", action="store_true", help="build the environment and start nothing")
     for one in fields(RigConfig):
         name, default = f"--{one.name.replace('_', '-')}", one.default

@@ -1,4 +1,4 @@
-"""The vendor's package in an environment of its own, one for each version, and Debian's broker."""
+"""Python environments with the vendor's package, one for each version, and Debian's broker."""
 
 import hashlib
 import os
@@ -17,14 +17,14 @@ PYTHONS = ("python3.13", "python3.14", "python3.12")
 
 
 def _python() -> str | None:
-    """Find a Python of 3.12 or newer: the vendor's package is written in its syntax."""
+    """Find a Python of 3.12 or newer, whose syntax the vendor's package uses."""
     beside = sorted(Path("~/.pyenv/versions").expanduser().glob("3.1[2-4]*/bin/python"), reverse=True)
     found = [path for name in PYTHONS if (path := shutil.which(name))]
     return next((p for p in [*map(str, beside), *found] if _runs(p)), None)
 
 
 def _runs(python: str) -> bool:
-    """Whether it starts at all: a version manager's stand-in may not."""
+    """Return whether a Python starts; the placeholder of a version manager may not."""
     return subprocess.run([python, "-c", "import ensurepip"], capture_output=True, check=False).returncode == 0
 
 
@@ -33,9 +33,9 @@ def broker() -> str | None:
 
 
 def home(package: str = PUBLISHED, folder: str = "") -> Path:
-    """Where the environment of a package is, built or not; a wheel is known by its name and content.
+    """Return the path of a package's environment, built or not; name and content of a wheel identify it.
 
-    Args: package: version on the package index, or path of a wheel. folder: of all environments, "" for the user's
+    Args: package: version on the package index, or path of a wheel. folder: folder of all environments, "": the user's
       cache.
     """
     wheel, key = Path(package).expanduser(), package.removeprefix("pioreactor==")
@@ -49,7 +49,7 @@ def version(env: Path) -> str:
 
 
 def missing(package: str = PUBLISHED, folder: str = "") -> str:
-    """Say what this computer lacks for the rig, with the remedy; "" if nothing but the environment itself."""
+    """Return what this computer lacks to build or run the rig, with the remedy; "" if nothing."""
     if broker() is None:
         return "no MQTT broker: apt-get install mosquitto"
     if package.endswith(".whl") and not Path(package).expanduser().is_file():
@@ -60,17 +60,19 @@ def missing(package: str = PUBLISHED, folder: str = "") -> str:
 
 
 def newer() -> str:
-    """Name a version on the package index newer than those tried, in a line; "" for none, or without network."""
+    """Return a line on a version on the package index that is newer than the tested ones; "" if none is found."""
     ask = [sys.executable, "-m", "pip", "index", "versions", "pioreactor", "--python-version", "3.13", "--retries", "0"]
     said = subprocess.run(ask, capture_output=True, text=True, check=False).stdout
     found = re.match(r"pioreactor \(([\d.]+)\)", said)
     if found is None or number(found[1]) <= number(TESTED[-1]):
         return ""
-    return f"the package index has version {found[1]} of the vendor's software, which was tried up to {TESTED[-1]}"
+    return (
+        f"the package index has version {found[1]} of the vendor's software; the newest tested version is {TESTED[-1]}"
+    )
 
 
 def environment(package: str = PUBLISHED, folder: str = "") -> Path:
-    """Build the environment of a package if it is not there. Raises: DeviceStateError with what is missing."""
+    """Build the environment of a package unless it exists. Raises: DeviceStateError naming what is missing."""
     if lack := missing(package, folder):
         raise DeviceStateError(f"the rig cannot be built: {lack}")
     env = home(package, folder)
@@ -78,11 +80,11 @@ def environment(package: str = PUBLISHED, folder: str = "") -> Path:
         return env
     python, wheel = _python(), Path(package).expanduser()
     assert python is not None
-    ours = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")  # they would point Python at our own packages
+    ours = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")  # with these Python imports this project's packages
     shutil.rmtree(env, ignore_errors=True)
     env.parent.mkdir(parents=True, exist_ok=True)
     found = f"{wheel.resolve()}[leader-worker]" if wheel.is_file() else f"pioreactor[leader-worker]=={env.name}"
-    needed = (found, "PyYAML")  # the second is needed and not declared
+    needed = (found, "PyYAML")  # the package needs PyYAML without declaring it
     for command in (
         [python, "-m", "venv", str(env)],
         [str(env / "bin" / "pip"), "install", "-q", "--disable-pip-version-check", *needed],
@@ -90,7 +92,7 @@ def environment(package: str = PUBLISHED, folder: str = "") -> Path:
         variables = {k: v for k, v in os.environ.items() if k not in ours}
         ran = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
         if ran.returncode:
-            reason = (ran.stderr.strip() or ran.stdout.strip() or "no word").splitlines()[-1]
+            reason = (ran.stderr.strip() or ran.stdout.strip() or "no output").splitlines()[-1]
             raise DeviceStateError(f"the rig cannot be built: {reason}; try {' '.join(command)}")
     (env / "done").touch()
     return env

@@ -1,4 +1,4 @@
-"""Pioreactors in software as a family: the same driver before the vendor's own programs around our vials."""
+"""The Pioreactor rig as a family: the driver of real units, and the vendor's software with simulated vials."""
 
 import logging
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class RigFamily(PioreactorFamily):
-    """Units of the run's own, which end with it."""
+    """Simulated units that a run starts, and that end with the run."""
 
     config = RigBackendConfig
     called = "the Pioreactor rig"

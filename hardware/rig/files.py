@@ -1,4 +1,4 @@
-"""The files that the vendor's software looks for on a unit, written to its documented formats."""
+"""The files that the vendor's software needs on a unit, written in its documented formats."""
 
 import json
 import sqlite3
@@ -9,18 +9,18 @@ from typing import Any
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.versions import Facts
 
-AT = "2026-01-01T00:00:00.000Z"  # when all of this was made
+AT = "2026-01-01T00:00:00.000Z"  # creation time in all files
 
-LOGIN = ("pioreactor", "raspberry")  # of the broker, as the vendor ships it
+LOGIN = ("pioreactor", "raspberry")  # name and password at the broker, as the vendor ships them
 
 PINS = {"stirring": 17, "media": 13, "alt_media": 16, "waste": 12, "heating": 18}
-"""GPIO pin of each output; 12 and 13 are the two that a chip drives on, whatever becomes of the process."""
+"""GPIO pin of each output; a chip drives pins 12 and 13, which therefore stay on when their process is killed."""
 
 CHANNELS = {"stirring": 1, "media": 2, "alt_media": 3, "waste": 4, "heating": 5}  # wiring as shipped
 
 ADC = ("pd2", "pd1", "aux", "version")  # by channel
 
-# A section and its entries a line. The tube's level stands under both of its names; the rest is the vendor's default.
+# One section with its entries per line. The tube's level has both of its names; the rest is the vendor's default.
 CONFIG = """cluster.topology leader_hostname={leader} leader_address=127.0.0.1
 cluster.addresses {addresses}
 mqtt username={login[0]} password={login[1]} broker_address=127.0.0.1 broker_port={broker} use_tls=0
@@ -67,7 +67,7 @@ FOLDERS = (
 
 
 def flows(k: int) -> dict[str, float]:
-    """mL/s of the pumps of the k-th unit: no two are alike; the tubes of the second give the same."""
+    """Return the flows of unit k's pumps, mL/s: all different, except that unit 1 has three equal pumps."""
     flow = {"media_pump": (1.0, 0.8, 1.25), "alt_media_pump": (0.9, 0.8, 1.1), "waste_pump": (2.0, 0.8, 1.9)}
     return {pump: ml_s[k % 3] for pump, ml_s in flow.items()}
 
@@ -80,7 +80,7 @@ def layout(
     folder: Path, unit: str, hosts: Mapping[str, str], known: Facts, flow: Mapping[str, float],
     values: Mapping[str, object],
 ) -> None:  # fmt: skip
-    """Everything below a unit's folder. Args: hosts: of all units. values: port, broker, database, login, volume_ml."""
+    """Write all files of a unit. Args: hosts: of all units. values: port, broker, database, login, volume_ml."""
     for name in FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     addresses = " ".join(f"{name}={host}" for name, host in hosts.items())
@@ -98,7 +98,7 @@ def layout(
 
 
 def _calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
-    """Build a calibration of a pump in the vendor's format, which moves `flow_ml_s` at full duty."""
+    """Build the calibration of a pump with `flow_ml_s` at full duty, in the vendor's format."""
     points, line = [0.5, 1.0, 2.0], [flow_ml_s, 0.0]
     curve = f"{{type: poly, coefficients: {line}}}" if known.curve_struct else f"{line}\ncurve_type: poly"
     return (
@@ -109,7 +109,7 @@ def _calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
 
 
 def database(path: Path, units: Mapping[str, float], experiment: str) -> None:
-    """Write what the leader must know: its units, and the experiment that all of them are assigned to."""
+    """Write the leader's database: its units, and the experiment to which all of them are assigned."""
     with sqlite3.connect(path) as db:
         db.executescript(TABLES)
         db.execute("INSERT INTO experiments VALUES (?, ?, '')", (experiment, AT))
@@ -119,6 +119,6 @@ def database(path: Path, units: Mapping[str, float], experiment: str) -> None:
 
 
 def wrapper(program: Path, variables: Mapping[str, str]) -> str:
-    """Write a script that runs one of the vendor's programs with the rig's variables, which its task queue drops."""
+    """Return a script that runs a program of the vendor with the rig's variables, which the task queue would drop."""
     lines = "".join(f"export {key}='{value}'\n" for key, value in variables.items())
     return f'#!/bin/sh\n{lines}exec "{program}" "$@"\n'

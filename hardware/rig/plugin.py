@@ -1,7 +1,7 @@
-"""What the vendor's software loads as a plugin in the rig: its mock sensor and pumps become those of our vials.
+"""Plugin of the vendor's software in the rig: it connects the vendor's mock sensor and pumps to the simulated vials.
 
-This file is copied beside the vendor's package and imported there, never here; it imports nothing of ours. A request is
-one JSON datagram to the rig, which answers each with one.
+This file is copied into the vendor's plugin folder and imported there, never here; it imports nothing of this project.
+A request is one JSON datagram to the rig, and so is its answer.
 """
 
 import importlib
@@ -16,13 +16,13 @@ from typing import Any
 __all__: list[str] = []
 
 UNIT, PORT = os.environ.get("HOSTNAME", ""), os.environ.get("TURBIDOSTAT_RIG_PORT", "")
-REUSE_S = 0.1  # a reading averages forty looks within a second
-REFERENCE = 0.1  # V of the photodiode that looks at the lamp
-NOISE = 0.02  # sd of one look, as a fraction; forty of them are averaged
+REUSE_S = 0.1  # time for which a value is reused; a reading averages forty values within a second
+REFERENCE = 0.1  # V of the photodiode that faces the lamp
+NOISE = 0.02  # sd of one value, as a fraction; a reading averages forty values
 
 
 def ask(what: dict[str, Any], timeout_s: float = 0.5) -> dict[str, Any]:
-    """Ask the rig; nothing after the timeout."""
+    """Send a request to the rig and return its answer; {} after the time-out."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.settimeout(timeout_s)
         try:
@@ -34,7 +34,7 @@ def ask(what: dict[str, Any], timeout_s: float = 0.5) -> dict[str, Any]:
 
 
 def leave_with_the_rig() -> None:
-    """End this process when the rig does not answer any more: somebody killed it."""
+    """End this process when the rig has not answered for a minute, because it was killed."""
     silent = 0
     while silent < 12:
         time.sleep(5.0)
@@ -43,7 +43,7 @@ def leave_with_the_rig() -> None:
 
 
 def install() -> None:
-    """Put our sensor, pumps and thermometer in the place of the vendor's mock ones."""
+    """Replace the vendor's mock sensor, pumps and thermometer by those of the simulated vials."""
     mock: Any = importlib.import_module("pioreactor.utils.mock")
     pwm: Any = importlib.import_module("pioreactor.utils.pwm")
     utils, config = importlib.import_module("pioreactor.utils"), importlib.import_module("pioreactor.config").config
@@ -52,7 +52,7 @@ def install() -> None:
     def look() -> dict[str, Any]:
         if time.monotonic() - seen["at"] > REUSE_S:
             seen.update(at=time.monotonic(), volts=ask({"ask": "volts"}).get("volts", 0.0))
-        with utils.local_intermittent_storage("leds") as leds:  # newer versions take dark and lit looks within 0.1 s
+        with utils.local_intermittent_storage("leds") as leds:  # newer versions read dark and lit within 0.1 s
             lit = float(leds.get(config.get("leds_reverse", "IR"), 0.0)) > 0.0
         return {"lit": lit, "volts": seen["volts"]}
 
@@ -67,7 +67,7 @@ def install() -> None:
     mock.MockTMP1075.get_temperature = lambda self: float(ask({"ask": "temperature"}).get("temperature", 25.0))
 
     class Output(mock.MockPWMOutputDevice):  # type: ignore[misc]
-        """A pin whose duty the rig's vial feels; as on a unit, whoever takes it switches it off first."""
+        """A pin whose duty acts on the rig's vial; as on a unit, a process that opens the pin first switches it off."""
 
         def __init__(self, pin: int, *args: Any, **values: Any) -> None:
             super().__init__(pin, *args, **values)
@@ -80,7 +80,7 @@ def install() -> None:
         def __setattr__(self, name: str, value: Any) -> None:
             super().__setattr__(name, value)
             if name == "dc":
-                ask({"pin": int(self.pin), "dc": float(value)}, 10.0)  # a pin is switched before its job goes on
+                ask({"pin": int(self.pin), "dc": float(value)}, 10.0)  # the job waits until the pin is switched
 
     pwm.MockPWMOutputDevice = Output
 

@@ -1,4 +1,4 @@
-"""The rig: broker, and for every unit the vendor's web server and task queue, around our vials; all end with it."""
+"""The rig: a broker, simulated vials, and for every unit the vendor's web server and task queue."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from hardware.rig.vials import VialServer, vial_preset
 WEB = (
     "import os, pioreactor.web.app as web\n"
     "if hasattr(web, 'client'):\n"
-    "    web.client._client_id = ('rig-web-' + os.environ['HOSTNAME']).encode()\n"  # else each throws out the other
+    "    web.client._client_id = ('rig-web-' + os.environ['HOSTNAME']).encode()\n"  # equal ids disconnect each other
     "web.create_app().run(host=os.environ['RIG_HOST'], port=int(os.environ['RIG_WEB_PORT']), threaded=True)\n"
 )
 BOOT_S = 90.0  # a busy computer
-UNIT = ("web", "tasks", "monitor")  # what boots with a unit; without any job the list of jobs is an error
-CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the task queue, as on a unit
+UNIT = ("web", "tasks", "monitor")  # processes that boot with a unit; without a job, the list of jobs is an error
+CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # options of the task queue, as on a unit
 
 
 class Rig:
-    """Everything that stands on a bench, as processes of this computer; use as a context manager.
+    """A bench of units as processes of this computer; use as a context manager, whose end ends all processes.
 
-    Args: units: names, and culture of each up to its waste tube, mL; unit k is at 127.0.0.k, the first leads. growth_x:
-      how much faster than real time the cultures grow. truth: folder of truth.jsonl, if not the rig's own, which is
-      removed with it. experiment: that all units are in. login: of the broker.
-    Attributes: version, of the software; web, address of each unit's web server; broker, port of MQTT; vials; folder;
-      processes by name.
-    Raises: DeviceStateError with what is missing or did not start.
+    Args: units: by name, the culture volume up to the waste tube, mL; unit k is at 127.0.0.k, and the first is the
+      leader. growth_x: growth rate over that of real time. truth: folder of truth.jsonl, None: the rig's folder, which
+      is removed at the end. experiment: experiment of all units. login: name and password at the broker.
+    Attributes: version: of the vendor's software. web: address of each unit's web server. broker: port of MQTT. vials.
+      folder: the rig's folder. processes: by name.
+    Raises: DeviceStateError naming what is missing or did not start.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Rig:
             home = self.folder / unit
             layout(home, unit, self.hosts, known, flows(k), {**where, "volume_ml": volume_ml})
             scripts = {name: wrapper(self._bin / name, self._variables(unit)) for name in ("pio", "pios")}
-            scripts["sudo"] = "#!/bin/sh\nexit 1\n"  # what a unit would shut down, reboot or restart is this computer
+            scripts["sudo"] = "#!/bin/sh\nexit 1\n"  # else a unit's shutdown or reboot would be this computer's
             for name, text in scripts.items():
                 (home / name).write_text(text, encoding="utf-8")
                 (home / name).chmod(0o755)
@@ -126,7 +126,7 @@ class Rig:
         self.processes[name].wait()
 
     def cut(self, unit: str) -> None:
-        """Cut the power of a unit: its processes end at once, its pins fall to 0, what lay in memory is gone."""
+        """Cut the power of a unit: its processes end at once, its pins fall to 0, its memory is lost."""
         for name in UNIT:
             self.kill(f"{unit} {name}")
         _kill(self.jobs(unit))
@@ -141,7 +141,7 @@ class Rig:
         _wait(self.hosts[unit], self.port, f"the web server of {unit}")
 
     def jobs(self, unit: str = "", job: str = "") -> list[int]:
-        """Process ids of the vendor's jobs of this name on a unit ("" for all), which have sessions of their own."""
+        """List the process ids of the vendor's jobs, in sessions of their own. Args: unit, job: names, "" for all."""
         home = f"RUN_PIOREACTOR={self.folder / unit}{chr(0) if unit else '/'}".encode()
         found = []
         for path in Path("/proc").glob("[0-9]*"):
@@ -152,7 +152,7 @@ class Rig:
         return found
 
     def close(self) -> None:
-        """End everything that the rig started, the vendor's jobs too. Idempotent."""
+        """End all processes of the rig, including the vendor's jobs. Idempotent."""
         for process in self.processes.values():
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
@@ -175,7 +175,7 @@ def _kill(pids: Sequence[int]) -> None:
 
 
 def _as_on_a_unit() -> None:
-    """In a child: be killed with the process that started us, and hear SIGINT, by which the vendor stops jobs."""
+    """Set up a child process: it is killed with its parent, and receives SIGINT, with which the vendor stops jobs."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     with contextlib.suppress(OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""Our vials as the vendor's software meets them: volts of a photodiode, duties of pins, a temperature."""
+"""Simulated vials with the interface of the vendor's software: photodiode volts, duties of pins, a temperature."""
 
 import json
 import math
@@ -19,17 +19,17 @@ from envs.plant.plant import Plant, PlantConfig
 from hardware.pioreactor.config import vial_ml
 from hardware.rig.files import PINS, flows
 
-VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with the reference at 0.1 V one unit of the reading is one OD
+VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with a reference of 0.1 V one unit of the reading is one OD
 PUMPS = {PINS[pump]: pump for pump in ("media", "alt_media", "waste")}  # a pin stays on when its process is killed
 MEDIA, ALT, WASTE = PUMPS
-HEATER = PINS["heating"]  # its process drives it
+HEATER = PINS["heating"]  # off when its process is killed
 VIAL_C, PLATE_C = 0.8, 0.48  # degC per percent of the heater's duty: vial above the room, plate above the vial
-PLATE_S = 70.0  # in which the plate follows: the vendor's estimate from its cooling is then the vial's within 0.4 degC
+PLATE_S = 70.0  # time constant of the plate; the vendor's estimate of the vial is then right within 0.4 degC
 
 
 @dataclass(frozen=True)
 class Pulse:
-    """One run of a pump: where, when (s since 1970), how long, and the fresh fluid it moved."""
+    """One run of a pump: unit, pump, start (s since 1970), duration, s, and fresh fluid moved, mL."""
 
     unit: str
     pump: str
@@ -39,7 +39,7 @@ class Pulse:
 
 
 def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float], growth_x: float) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml` in the vendor's vial, with the flows of its pumps, mL/s. Raises: ValueError."""
+    """Build the preset `conf/plant/NAME.yaml` in the vendor's vial, with pump flows, mL/s. Raises: ValueError."""
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=float(vial_ml(volume_ml)))
     pump = replace(plant.pump, dosing="pulse", gain_ml_s=flow["media_pump"], waste_ml_s=flow["waste_pump"])
@@ -48,12 +48,12 @@ def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float
 
 
 class _Vial:
-    """One culture with its pumps and its heater, in real seconds; growth alone runs `growth_x` times faster.
+    """One culture with its pumps and its heater in real time; only growth is `growth_x` times faster.
 
-    It stays at its temperature until the heater is first driven, and then at what the heater makes of it.
+    The vial keeps its temperature until the heater is first driven; then the heater sets the temperature.
 
-    Attributes: offset_od, added to what the photodiode sees; held_od, what it sees for ever, nan for the culture;
-      heat, duty of the heater, nan before that; plate_c, by how much its plate is warmer than the vial.
+    Attributes: offset_od: OD added to every reading. held_od: constant OD of all readings, nan: the culture's OD.
+      heat: duty of the heater, %, nan before its first use. plate_c: temperature of the plate above the vial, degC.
     """
 
     def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any, alt_ml_s: float = 0.0) -> None:
@@ -73,7 +73,7 @@ class _Vial:
         return true + self.offset_od
 
     def sync(self, now: float) -> None:
-        """Let time pass up to now; a heater whose process is gone is off."""
+        """Advance the vial to the time `now`; the heater is off if its process is gone."""
         seconds = now - self.at
         if seconds <= 1e-4:
             return
@@ -90,7 +90,7 @@ class _Vial:
         self.peak_ml = max(self.peak_ml, float(self.plant.vessel.volume_ml[0]))
 
     def drive(self, pin: int, duty: float, pid: int, now: float) -> None:
-        """Change a pin's duty, in percent."""
+        """Set a pin's duty, %, for the process `pid`."""
         self.sync(now)
         if pin == HEATER:
             self.heat, self._heated_by = duty, pid
@@ -109,7 +109,7 @@ class _Vial:
         self.duty[pin] = duty
 
     def truth(self) -> dict[str, Any]:
-        """Return what is really in the vial and what was really moved."""
+        """Return the true state of the vial and the true volumes moved."""
         return {
             "od": float(self.plant.apparent_od[0]),
             "volume_ml": float(self.plant.vessel.volume_ml[0]),
@@ -122,9 +122,9 @@ class _Vial:
 
 
 class VialServer:
-    """All vials behind one UDP port, on a thread of its own; truth.jsonl in a folder has every run of a pump.
+    """All vials behind one UDP port, served by a thread; every run of a pump is written to truth.jsonl in `folder`.
 
-    Args: plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
+    Args: plants: plant config of each vial, by its unit's name. growth_x: growth rate over that of real time.
     """
 
     def __init__(self, plants: Mapping[str, PlantConfig], growth_x: float, folder: Path, seed: int = 0) -> None:
@@ -193,7 +193,7 @@ class VialServer:
 
 
 def _alive(pid: int) -> bool:
-    """Whether a process runs: not gone, and not only waiting to be collected."""
+    """Return whether a process runs: it is neither gone nor a zombie."""
     try:
         os.kill(pid, 0)
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]

@@ -1,4 +1,4 @@
-"""What may be fed: the ledger of feed and level, and the limits on a proposal."""
+"""Feed budget: the ledger of feed and level, and the limits on a proposed feed rate."""
 
 import math
 
@@ -13,12 +13,12 @@ from hardware.safety.readings import Finding
 
 
 class FeedBudget:
-    """Feed of N reactors over the last minute, the last hour and the run, and the volume it leaves in the vial.
+    """Feed of N reactors over the last minute, the last hour and the run, and the volume in each vial.
 
-    Args: bench: period and largest rate. tube_ml, full_ml: level that the waste tube keeps, and more than which is an
-      overflow, mL, shape (N,).
-    Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; bottle_ml, what the bottles hold for
-      the whole run; all of shape (N,).
+    Args: bench: period and largest rate. tube_ml: volume at the waste tube, mL, (N,). full_ml: volume above which a
+      vial overflows, mL, (N,).
+    Attributes: fed_ml: feed since the run began. volume_ml: volume in the vial. bottle_ml: feed that the bottles
+      provide for the whole run. All in mL, shape (N,).
     """
 
     remembers = (
@@ -35,8 +35,8 @@ class FeedBudget:
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
         self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
         self._owed_ml = np.zeros(n)  # allowed but not dosed since the last dose
-        self._paid_ml = np.zeros(n)  # of it, what that dose settled
-        self._unusable = np.zeros(n)  # proposals in a row that were no rate
+        self._paid_ml = np.zeros(n)  # part of it that the last dose settled
+        self._unusable = np.zeros(n)  # unusable proposals in a row
 
     def check(self, rate: Array, fresh: Mask, now: float) -> tuple[Array, list[Finding]]:
         """Limit the proposed feed rates, mL/s, shape (N,), and report what is wrong with them."""
@@ -57,7 +57,7 @@ class FeedBudget:
         for fault, room in self._room(now).items():
             asked = allowed * bench.period_s
             over = asked > room + 1e-9
-            if fault is messages.BudgetFault:  # a repetition may overdraw it; nothing asked is nothing refused
+            if fault is messages.BudgetFault:  # repetitions may exceed it without a request
                 over &= asked > 0.0
             findings.append(Finding(fault, over, {"left_ml": np.maximum(room, 0.0), "asked_ml": asked}))
             allowed = np.where(over, 0.0, allowed)
@@ -84,14 +84,14 @@ class FeedBudget:
         self._minute = minute
 
     def grant(self, rate: Array) -> None:
-        """Remember what is allowed now, mL/s, shape (N,), until it is dosed."""
+        """Note the allowed rate, mL/s, shape (N,), as a volume that is owed until the next dose."""
         self._owed_ml = self._owed_ml + rate * self._bench.period_s
 
     def book(self, feed: Array, waste: Array, now: float) -> None:
-        """Book what was dosed at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), V + feed where waste is 0.
+        """Book doses at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), or V + feed where waste is 0.
 
-        Either may be negative: it corrects what was booked before it was known. `now` may lie before what another
-        reactor was booked at; what lies an hour back counts only for the run.
+        A negative volume corrects an earlier booking. `now` may be earlier than the last booking; a dose more than one
+        hour old counts only for the run.
         """
         self._roll(now)
         within = self._minute - now // 60.0 < 60.0

@@ -11,10 +11,10 @@ from hardware.safety.messages import BudgetFault, FallsFault, FluorescenceLostFa
 
 
 class Response(IntEnum):
-    """What is to be done with a reactor, in order of severity.
+    """Action of the interlock on a reactor, in order of severity.
 
-    PASS: dose as allowed. HOLD: no dose for this sample. PUMPS_OFF: no dose, and switch its pumps off, verified.
-    REGULATE: hand over to the device's own OD regulation for good. STOP: no further dose in this run, pumps off.
+    PASS: dose as allowed. HOLD: no dose for this sample. PUMPS_OFF: no dose, and switch the pumps off, verified.
+    REGULATE: hand over to the device's own OD regulation for this run. STOP: no further dose in this run, pumps off.
     """
 
     PASS = 0
@@ -29,13 +29,13 @@ NOT_REGULATE = ("report", "hold", "pumps_off", "stop")
 _DONE = ("reported", "no dose", "pumps off", "handed over to the on-board regulation", "stopped")
 DONE = dict(zip(Response, _DONE, strict=True))
 
-MAX_SETPOINT = 1.5  # OD; a larger one is a typing error
+MAX_SETPOINT = 1.5  # OD; a larger setpoint is a typing error
 RAW_MIN, RAW_MAX = 5.0, 65534.0  # counts: a failed spectrometer reads 1, a saturated one 65535
 
 
 @dataclass(frozen=True)
 class Responses:
-    """Responses of which a lab may choose others, by the words of `Response`; report is its PASS."""
+    """Responses to faults that a lab may change; with `report`, doses continue."""
 
     budget: str = setting(BudgetFault.response, "a feed budget is used up", choices=tuple(WORDS)[1:])
     jump: str = setting(JumpFault.response, "a step that neither growth nor a dose explains", choices=NOT_REGULATE)
@@ -52,11 +52,11 @@ class Responses:
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Limits of the interlock between every controller and every pump, beside what the bench says; its own ledger."""
+    """Limits of the interlock, which stands between every controller and every pump and keeps its own ledger."""
 
     ml_per_minute: float | None = setting(
         None,
-        "feed budget per minute; null: 2.5 of the largest doses, since 60 s can contain two",
+        "feed budget per minute; null: 2.5 times the largest dose, as 60 s can contain two doses",
         "mL",
         above=0.0,
         below=math.inf,
@@ -70,11 +70,9 @@ class SafetyConfig:
     od_max: float = setting(4.0, "highest possible reading", "OD", within=(MAX_SETPOINT, 10))
     mu_max: float = setting(0.04, "fastest possible growth (LB at 37 degC: 0.031)", "1/min", within=(0.001, 0.1))
     death: float = setting(0.005, "fastest possible decline without a dose", "1/min", within=(0, 0.1))
-    jump: float = setting(
-        0.04, "largest step that is not explained by growth and dose", "OD", above=0.0, below=math.inf
-    )
+    jump: float = setting(0.04, "largest step of the OD beyond growth and dose", "OD", above=0.0, below=math.inf)
     jump_fraction: float = setting(
-        0.08, "the same as a fraction of the OD; 0.6 % of readings are such outliers", within=(0, 1)
+        0.08, "largest step as a fraction of the OD, if above jump; 0.6 % of readings exceed it", within=(0, 1)
     )
     drift: float = setting(
         0.05,
@@ -88,12 +86,14 @@ class SafetyConfig:
     stale_s: float | None = setting(
         None, "age at which the newest sample is stale; null: a control period plus 40 s", "s", at_most=7200.0
     )
-    lost_s: float | None = setting(None, "age at which it is lost; null: three control periods", "s", at_most=14400.0)
-    silent: float = setting(120.0, "silence after which the run ends a reactor", "min", above=0.0, below=math.inf)
+    lost_s: float | None = setting(
+        None, "age at which the sample is lost; null: three control periods", "s", at_most=14400.0
+    )
+    silent: float = setting(120.0, "age of a sample at which its reactor is stopped", "min", above=0.0, below=math.inf)
     cooling: float = setting(
         90.0, "slowest time constant of cooling to a lower target", "min", above=0.0, below=math.inf
     )
-    light_min: float = setting(1.0, "fluorescence below is a dead LED or spectrometer", "counts", within=(0, 65534))
+    light_min: float = setting(1.0, "smallest fluorescence of a working LED and sensor", "counts", within=(0, 65534))
     frozen_light: int = setting(5, "equal fluorescence readings in a row that count as frozen", within=(2, 60))
     light_lost: float = setting(
         15.0, "time without a valid fluorescence until it is reported", "min", above=0.0, below=math.inf
@@ -102,10 +102,8 @@ class SafetyConfig:
         29.0, "lowest target of a composition controller; composition_high or less", "degC", within=(15, 42)
     )
     composition_high: float = setting(36.0, "highest target of a composition controller", "degC", within=(15, 42))
-    controller_patience: int = setting(5, "unusable proposals in a row until it counts as failed", within=(1, 60))
-    responses: Responses = part(
-        Responses, "what is done about some reasons; about all others what docs/three_am.md says"
-    )
+    controller_patience: int = setting(5, "unusable proposals in a row that count as a failure", within=(1, 60))
+    responses: Responses = part(Responses, "responses to some faults; docs/three_am.md has those to all others")
 
     def __post_init__(self) -> None:
         check(self, "safety")
@@ -117,7 +115,7 @@ class SafetyConfig:
         return WORDS[getattr(self.responses, fault.kind, fault.response)]
 
     def ml_a_minute(self, bench: Bench) -> float:
-        """Feed budget of a minute, mL."""
+        """Return the feed budget of a minute, mL."""
         return 2.5 * (bench.max_rate * bench.period_s) if self.ml_per_minute is None else self.ml_per_minute
 
     @property
@@ -126,7 +124,7 @@ class SafetyConfig:
         return self.composition_low, self.composition_high
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
-        """Ages at which a newest sample is stale and lost, s. Raises: ValueError for less than a control period."""
+        """Return the ages, s, at which a sample is stale and lost. Raises: ValueError below a control period."""
         stale_s = bench.stale_s if self.stale_s is None else self.stale_s
         lost_s = max(3.0 * bench.period_s, stale_s) if self.lost_s is None else self.lost_s
         require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")

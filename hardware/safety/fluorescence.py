@@ -11,15 +11,15 @@ from hardware.safety.readings import Finding
 
 
 class Light:
-    """Plausibility of the newest fluorescence of N reactors, where it is measured; it is no basis of a dose."""
+    """Plausibility of the newest fluorescence of N reactors, if it is measured; no dose depends on it."""
 
     remembers = ("_light", "_light_repeats", "_light_s")
 
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config
-        self._light = np.full(n, math.nan)  # the newest reading, believed or not
+        self._light = np.full(n, math.nan)  # the newest reading, valid or not
         self._light_repeats = np.zeros(n)  # samples in a row that were equal to the one before
-        self._light_s = np.full(n, math.nan)  # when a reading was last believed, or first asked for
+        self._light_s = np.full(n, math.nan)  # time of the last valid reading, or of the first check
 
     def check(self, m: Measurement, now: float) -> list[Finding]:
         """Find what is wrong with the fresh readings of `m`; `now`: run time, s."""

@@ -31,14 +31,14 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 @dataclass(frozen=True)
 class Ruling:
-    """What may be done now.
+    """The interlock's decision on one step.
 
     rate: allowed feed rate, mL/s, shape (N,); 0 for every row that is not fresh or is held.
     response: a `Response` per reactor, shape (N,).
-    reasons: per reactor None, or reason, action taken and remedy in one line.
-    faults: per reactor what was found.
+    reasons: per reactor one line with reasons, actions and remedies, or None.
+    faults: per reactor the faults that were found.
     heat_off: reactors whose heating must be off, shape (N,).
-    setpoint: a sane target for the on-board regulation, shape (N,).
+    setpoint: valid target for the on-board regulation, OD, shape (N,).
     """
 
     rate: Array
@@ -54,11 +54,11 @@ class Ruling:
 
 
 class Interlock:
-    """Stands between controllers and pumps of N reactors: asks its five parts, then concludes.
+    """Interlock between controllers and pumps of N reactors: collects the findings of its five parts, then decides.
 
-    Args: bench: volume, period and largest rate. tube_ml: level of each waste tube, where they differ, (N,). rim_ml:
-      what a vial holds, one for all or (N,).
-    Attributes: budget, the ledger of feed and level.
+    Args: bench: volume, period and largest rate. tube_ml: volume at each waste tube, mL, (N,); None: the bench's
+      volume. rim_ml: capacity of a vial, mL, one value or (N,).
+    Attributes: budget: the ledger of feed and level.
     """
 
     remembers = ("_hold_until_s", "_hold_kind", "_latched")
@@ -80,19 +80,18 @@ class Interlock:
         self._heat = Heat(n, self.config)
         self._light = Light(n, self.config)
         self._parts = (self.budget, self._readings, self._change, self._heat, self._light)
-        self._cut: dict[str, Finding] = {}  # commands out of range, until `check` has told of them
+        self._cut: dict[str, Finding] = {}  # commands out of range, until `check` reports them
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into PAUSES
-        self._latched = np.zeros(n)  # a `Response` that no later one may fall below
+        self._latched = np.zeros(n)  # least `Response` for the rest of the run
 
     def check(
         self, measurement: Measurement, rate: Array, setpoint: Array, temperature_target: Array, now: float
     ) -> Ruling:
-        """Judge the newest samples and the proposed feed rates. Raises: nothing; what is wrong is in the verdict.
+        """Judge the newest samples and the proposed feed rates. Raises: nothing; the faults are in the ruling.
 
-        Args: measurement: what the reactors said. rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh
-          sample count. setpoint: OD, (N,). temperature_target: degC, (N,), nan without a thermostat. now: monotonic
-          time, s.
+        Args: measurement: newest samples. rate: proposed feed rate, mL/s, shape (N,); only rows with a fresh sample
+          count. setpoint: OD, (N,). temperature_target: degC, (N,), nan without a thermostat. now: monotonic time, s.
         """
         rate, setpoint = np.array(rate, dtype=np.float64), np.array(setpoint, dtype=np.float64)
         target_c = np.asarray(temperature_target, dtype=np.float64)
@@ -114,7 +113,7 @@ class Interlock:
     def believes(self, measurement: Measurement) -> Mask:
         """Return rows whose fresh reading is valid for control, shape (N,); called before `check`, changes nothing.
 
-        A step that nothing explains may be only where `jump` is no more than reported.
+        A reading after an unexplained step is valid only if the response to `jump` is report.
         """
         believed = self._readings.believed(measurement, np.asarray(measurement.fresh, dtype=np.bool_))
         if self.config.response(messages.JumpFault) is Response.PASS:
@@ -126,7 +125,7 @@ class Interlock:
         return self._light.believed(measurement)
 
     def command(self, actuator: Actuator, asked: Array) -> Array:
-        """Cut what a signal asks of an actuator to its limits, (N,); nan stays. The next `check` reports the cut."""
+        """Cut a signal's commands, (N,), to the limits of an actuator; nan stays. The next `check` reports a cut."""
         low, high = actuator.low, actuator.high
         if actuator.pump:
             low, high = 0.0, self.bench.max_rate
@@ -144,8 +143,8 @@ class Interlock:
         return [[fault] if fault is not None else [] for fault in faults]
 
     def _collect(self, found: list[list[Fault]], findings: Sequence[Finding], now: float) -> None:
-        """Add the findings to each reactor's faults; some begin a while without a dose."""
-        told = [[fault.kind for fault in faults] for faults in found]  # by the reactor, which says more
+        """Add the findings to each reactor's faults; some findings start a pause without doses."""
+        told = [[fault.kind for fault in faults] for faults in found]  # by the reactor, with more detail
         for finding in findings:
             for i in np.flatnonzero(finding.rows):
                 found[i] += [finding.of(int(i))] if finding.fault.kind not in told[i] else []
@@ -176,7 +175,7 @@ class Interlock:
         return Ruling(rate, response, lines, tuple(map(tuple, found)), self._heat.off, setpoint)
 
     def _response(self, fault: Fault) -> Response:
-        """Return the response to a fault; a pause has gone through that of its fault, and only holds."""
+        """Return the response to a fault; the pause after a fault only holds."""
         return Response.HOLD if isinstance(fault, PAUSES) else self.config.response(fault)
 
     def confirm(self, receipt: Receipt, now: float) -> None:
@@ -194,11 +193,11 @@ class Interlock:
             self._hold_until_s[row] = -math.inf
 
     def latch(self, response: Response, rows: Mask) -> None:
-        """Never respond with less than this for `rows`, shape (N,), in this run."""
+        """Respond with at least `response` to `rows`, shape (N,), for the rest of the run."""
         self._latched = np.where(rows, np.maximum(self._latched, float(response)), self._latched)
 
     def state(self) -> dict[str, Any]:
-        """Everything it remembers, as plain lists; times are those given to `check`, so give it run time."""
+        """Return the interlock's state as plain lists. Its times are those given to `check`: pass run time there."""
         return {key: value for part in (*self._parts, self) for key, value in memory.save(part).items()}
 
     def restore(self, state: Any) -> None:
@@ -213,5 +212,5 @@ class Interlock:
 
 
 def kinds_of(text: str) -> list[str]:
-    """List the kinds of the reasons in a line of the interlock's."""
+    """List the fault kinds in a line of the interlock."""
     return [kind for kind, colon, _ in (part.partition(": ") for part in text.split(" | ")) if colon]

@@ -1,4 +1,4 @@
-"""Checks of single samples: in time, possible for a working sensor, not too hot."""
+"""Checks of single samples: age, plausibility of the OD, temperature."""
 
 import math
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples
 
 @dataclass(frozen=True)
 class Finding:
-    """Something is wrong with some reactors: the fault, and its rows, shape (N,).
+    """A fault, and the rows of the reactors that have it, shape (N,).
 
-    seen: the values of the fault's sentence, one for all or of shape (N,). cool: reactors that get no dose for a while
-    after this, unless the fault is only reported; None for none.
+    seen: values for the fault's sentence, each one for all reactors or of shape (N,). cool: reactors that get a pause
+    without doses, unless the fault is only reported; None: no reactor.
     """
 
     fault: type[Fault]
@@ -34,14 +34,14 @@ class Finding:
 
 
 class Readings:
-    """Plausibility of the newest sample of N reactors, each by itself, and its age: stale_s or lost_s is too much."""
+    """Plausibility and age of the newest sample of N reactors. Args: stale_s, lost_s: age of a stale or lost sample."""
 
     remembers = ("_fresh_s", "_seen", "_repeats")
 
     def __init__(self, n: int, config: SafetyConfig, stale_s: float, lost_s: float) -> None:
         self._config, self._stale_s, self._lost_s = config, stale_s, lost_s
         self._fresh_s = np.full(n, math.nan)  # when the newest sample came
-        self._seen = np.full(n, math.nan)  # its reading, believed or not
+        self._seen = np.full(n, math.nan)  # its reading, valid or not
         self._repeats = np.zeros(n)  # samples in a row that were equal to the one before
 
     def check(self, m: Measurement, fresh: Mask, now: float) -> tuple[Mask, list[Finding]]:
@@ -62,7 +62,7 @@ class Readings:
         return self._judge(m, fresh)[0]
 
     def _raw(self, m: Measurement) -> Array:
-        """Check counts; without a device there are none, and they pass."""
+        """Return the counts; without a device, counts that pass the checks."""
         return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
     def _judge(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Mask, Array]:
@@ -94,9 +94,9 @@ class Readings:
 
 
 class Heat:
-    """Temperatures of N reactors against their targets; once heating must be off, it stays so.
+    """Temperatures of N reactors compared with their targets; heating that must be off stays off.
 
-    Too hot is not a vial that still cools down to a lower target; a thermometer may read nonsense.
+    A vial that still cools down to a lower target is not too hot. Impossible readings end the heating, too.
     """
 
     remembers = ("_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off")
@@ -104,7 +104,7 @@ class Heat:
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config
         self._target_c = np.full(n, math.nan)
-        self._relief_c = np.zeros(n)  # how far above the target cooling down still explains
+        self._relief_c = np.zeros(n)  # excess over the target that cooling down explains
         self._thermo_s = np.full(n, math.nan)  # when the temperature was last known
         self._hot, self._too_hot, self._nonsense = np.zeros(n), np.zeros(n), np.zeros(n)  # samples in a row
         self._heat_off = np.zeros(n)

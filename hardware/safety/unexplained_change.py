@@ -1,4 +1,4 @@
-"""Changes of the OD that growth, doses and noise do not explain: steps at once, drifts by a cumulated sum."""
+"""Changes of the OD that growth, doses and noise do not explain: single steps, and drifts by cumulated sums."""
 
 import math
 
@@ -9,19 +9,19 @@ from hardware.safety import messages
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
 
-GAIN_MIN, GAIN_MAX = 0.5, 1.6  # least and most that a dose delivers, of what its calibration says
-ACCEPT_UP, ACCEPT_DOWN = 6, 3  # consistent readings after which a step is believed; bubbles last up to five
+GAIN_MIN, GAIN_MAX = 0.5, 1.6  # smallest and largest volume delivered, over that of the calibration
+ACCEPT_UP, ACCEPT_DOWN = 6, 3  # consistent readings after which a step is accepted; bubbles last up to five
 PERSISTENCE = 3  # samples in a row
 
 
 class UnexplainedChange:
     """The newest accepted reading of N reactors, the doses since, and the changes that they do not explain.
 
-    A culture makes no step. A step is accepted only if enough later readings agree with it: a bubble goes, a moved vial
-    stays. A change small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
-    `excess` (ln OD rises more than the doses allow), `deficit` (it falls more than they explain) and `futile` (it does
-    not fall at full feed). The last is no event but a condition: it lasts until the feed is no longer full, the
-    setpoint is reached, or OD falls after all.
+    A culture makes no step. A step is accepted only if enough later readings agree with it: a bubble disappears, a
+    moved vial stays. A change small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
+    `excess` (ln OD rises more than the doses allow), `deficit` (ln OD falls more than the doses explain) and `futile`
+    (ln OD does not fall at full feed). An alarm of `futile` lasts until the feed is no longer full, the setpoint is
+    reached, or OD falls.
     """
 
     remembers = (
@@ -31,16 +31,16 @@ class UnexplainedChange:
 
     def __init__(self, config: SafetyConfig, max_rate: float, tube_ml: Array) -> None:
         self._config, self._max_rate, self._tube_ml, n = config, max_rate, tube_ml, len(tube_ml)
-        self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest believed reading and its minute
+        self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest accepted reading and its minute
         self._since_ml, self._since_low_ml = np.zeros(n), np.zeros(n)  # dosed since then, at most and at least
         self._suspect, self._suspect_at = np.full(n, math.nan), np.full(n, math.nan)  # newest reading after a step
-        self._suspects = np.zeros(n)  # readings in a row that agree with one another, not with the believed one
+        self._suspects = np.zeros(n)  # readings in a row that agree with one another, not with `_od`
         self._mu = np.full(n, config.mu_max)  # slow estimate of the growth rate
         self._excess, self._deficit, self._futile = np.zeros(n), np.zeros(n), np.zeros(n)
         self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
-        self._helpless_od = np.full(n, math.nan)  # highest OD since full feed was found not to be enough; nan: it is
+        self._helpless_od = np.full(n, math.nan)  # highest OD since full feed was found insufficient; else nan
         self._doubt_ml = np.zeros(n)  # dosed since the excess was 0
-        self._eased = np.zeros(n)  # samples in a row that speak against it
+        self._eased = np.zeros(n)  # samples in a row that show full feed to be sufficient
 
     def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
         """Judge the readings of the `believed` rows: OD, the times they were taken, s, and setpoint, each (N,)."""
@@ -68,9 +68,9 @@ class UnexplainedChange:
         return np.asarray(believed & (~step | settled))
 
     def _steps(self, od: Array, t: Array) -> tuple[Mask, Mask, Array, Mask]:
-        """Rows with a step, of these those downwards, steps in a row that agree, and rows where they are enough.
+        """Return rows with a step, rows that fell, agreeing steps in a row, and rows where these suffice.
 
-        Args: od: believed readings, else nan, shape (N,). t: when they were taken, min, shape (N,).
+        Args: od: valid readings, else nan, shape (N,). t: times at which they were taken, min, shape (N,).
         """
         known = np.isfinite(od)
         with np.errstate(invalid="ignore"):
@@ -92,12 +92,12 @@ class UnexplainedChange:
         return low, high
 
     def _accumulate(self, od: Array, t: Array, usual: Mask, setpoint: Array) -> list[Finding]:
-        """Cumulated sums of what ln OD did beyond the best and the worst explanation.
+        """Update the cumulated sums of changes of ln OD that neither growth nor doses explain.
 
-        With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d, and
-        no culture gives x < -gain_max d - death dt; d is the least, and the most, that can have been dosed. mu is a
-        slow estimate (60 min) plus 0.01 1/min. At full feed (0.8 of the largest rate and more) x must be below
-        -0.004 dt, or the culture outgrows the pump.
+        x is the change of ln OD in dt minutes, d = dosed / volume. A working pump gives x <= mu dt - gain_min d with
+        the smallest possible d. No culture gives x < -gain_max d - death dt with the largest possible d. mu is a slow
+        estimate (60 min) plus 0.01 1/min. At full feed (0.8 of the largest rate and more) x must be below -0.004 dt,
+        or the culture outgrows the pump.
         """
         c = self._config
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -134,7 +134,7 @@ class UnexplainedChange:
         ]
 
     def _lasting(self, begins: Mask, od: Array, usual: Mask, short: Mask, limit: Array) -> Mask:
-        """Reactors in which full feed does not reach the setpoint: from when a sum says so until that has eased."""
+        """Return reactors whose full feed does not reach the setpoint, from an alarm of the sum until it has eased."""
         highest = np.fmax(self._helpless_od, np.where(usual, od, -math.inf))
         lasts = np.isfinite(self._helpless_od)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -146,7 +146,7 @@ class UnexplainedChange:
         return np.asarray(np.isfinite(self._helpless_od))
 
     def refilled(self, row: int) -> None:
-        """Forget what speaks for an empty bottle."""
+        """Forget the evidence for an empty bottle."""
         self._excess[row] = self._over[row, 0] = self._since_low_ml[row] = 0.0
 
     def dosed(self, feed_ml: Array, low_ml: Array) -> None:

@@ -1,4 +1,4 @@
-"""A file that is either whole or as it was before."""
+"""Atomic writes: afterwards a file is either complete or unchanged."""
 
 import os
 import secrets
@@ -9,9 +9,9 @@ from pathlib import Path
 def write(path: Path, data: bytes | str, fsync: bool = True) -> None:
     """Replace the content of `path` in one step: nobody ever reads half a file. Text is written as UTF-8.
 
-    The data go into `path` + ".xxxxxxxx.part", which then takes the place of `path`. Each call has its own x: of
-    several processes that write one file at once, on one machine or on a shared disk, the last one's stands. With fsync
-    file and folder are on the disk when this returns. Raises: OSError where the disk refuses; `path` is then as it was.
+    The data go into `path` + ".xxxxxxxx.part", which then replaces `path`. The x are random, so several processes may
+    write one file at once, also on a shared disk: the last one wins. With fsync, file and folder are on the disk when
+    this returns. Raises: OSError if the disk refuses; `path` is then unchanged.
     """
     temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
@@ -30,7 +30,7 @@ def write(path: Path, data: bytes | str, fsync: bool = True) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Put the names in a folder on the disk: a new file can be found after a power cut only then."""
+    """Flush the names in a folder to the disk, so that a new file in it survives a power cut."""
     folder = os.open(path, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -1,8 +1,8 @@
 """Doses in the journal, in the rows of every family: volume and repetitions of each.
 
-`intent` before a dose that was commanded, `feed_on` before its pump is switched on or asked for, `dose_end` after it,
-`given` for what was dosed without a command. Each says when (run time, s), how much (feed_ml and waste_ml at most,
-feed_low_ml at least), and by which pump where that is not the feed.
+Kinds of rows: `intent` before a commanded dose, `feed_on` before the command to its pump, `dose_end` after the dose,
+`given` for a dose without a command. Each row has the run time, s, the volumes (largest: feed_ml and waste_ml;
+smallest: feed_low_ml), and the pump if it is not the feed pump.
 """
 
 import math
@@ -14,15 +14,15 @@ from hardware.errors import RecordingError
 from hardware.storage.messages import RowDamaged
 
 REPEAT_S = 63.0
-"""Seconds between two repetitions of a dose, of which a row has the number: the period of a Chi.Bio."""
+"""Seconds between two repetitions of a dose: the pump period of a Chi.Bio. A row has the number of repetitions."""
 FEEDS = {"Pump1": 1, "Pump3": 3, "Pump4": 4}  # pumps that an intent may name, and their numbers
 
 
 @dataclass(frozen=True)
 class Given:
-    """What was given beyond what was booked: run time, s; volumes, mL, negative where less was given.
+    """Volumes given beyond those booked, mL, negative where less was given; at_s: run time, s.
 
-    low_ml: the least that can have been fed. pump: number of the spare pump that gave it, 0 for the feed.
+    low_ml: smallest feed that may have been given. pump: number of the spare pump that gave it, 0 for the feed pump.
     """
 
     at_s: float
@@ -38,12 +38,12 @@ class Given:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a dose ended.
+    """Outcome of a dose. Volumes are the largest possible ones, mL, unless stated otherwise.
 
-    on_s: run time at which its pumps were switched on, s. feed_ml, waste_ml: what it gave, at most. feed_times,
-    waste_times: how often the device gave the same again, every 63 s from `on_s` on, before the pump was off; the last
-    time feed_last_ml, waste_last_ml, nan: the same too. pump: number of the spare pump that gave it, 0 for the feed.
-    feed_low_ml: the least that it gave with its repetitions, nan: as much as the most.
+    on_s: run time at which its pumps were switched on, s. feed_ml, waste_ml: volumes of the dose itself. feed_times,
+    waste_times: number of repetitions by the device, every 63 s after `on_s`. feed_last_ml, waste_last_ml: volume of
+    the last repetition; nan: as the dose. pump: number of the spare pump that fed, 0 for the feed pump. feed_low_ml:
+    smallest feed of the dose with its repetitions; nan: equal to the largest.
     """
 
     on_s: float
@@ -63,12 +63,12 @@ class Ending:
 
     @property
     def least(self) -> float:
-        """Which part of the most it gave at least, 0 to 1."""
+        """Smallest feed as a fraction of the largest, 0 to 1."""
         most_ml = self.feed_ml + self.repeated_ml
         return 1.0 if math.isnan(self.feed_low_ml) or most_ml <= 0.0 else min(self.feed_low_ml / most_ml, 1.0)
 
     def repeats(self) -> list[tuple[float, float, float]]:
-        """Each repetition: run time, s, and volumes of feed and waste, mL."""
+        """List the repetitions: run time, s, and volumes of feed and waste, mL."""
 
         def nth(k: int, times: int, ml: float, last_ml: float) -> float:
             return (last_ml if k == times and not math.isnan(last_ml) else ml) if k <= times else 0.0
@@ -83,7 +83,7 @@ class Ending:
         ]
 
     def beyond(self, booked_ml: float) -> list[Given]:
-        """Return what the dose gave beyond the feed booked when it began, its waste with it, in the order of time."""
+        """Return the volumes, feed and waste, beyond the feed that was booked when the dose began, in order of time."""
         low_ml, more_ml = self.least * self.feed_ml - booked_ml, self.feed_ml - booked_ml
         first = [Given(self.on_s, more_ml, low_ml, more_ml, self.pump)] if max(abs(more_ml), abs(low_ml)) > 1e-3 else []
         again = [Given(at_s, ml, self.least * ml, waste_ml, self.pump) for at_s, ml, waste_ml in self.repeats()]
@@ -104,10 +104,10 @@ class Ending:
 
 @dataclass(frozen=True)
 class Dosed:
-    """What was dosed at one moment.
+    """One dose, or one repetition of a dose (again).
 
-    n: row of the journal that tells: the intent, or, where the device repeated a dose (again), its end. at_s: run time,
-    s. Volumes in mL. pump: number of the pump that gave the medium.
+    n: number of its row in the journal: the intent of a dose, the end of the dose for a repetition. at_s: run time, s.
+    feed_ml, waste_ml: volumes, mL. pump: number of the pump that fed.
     """
 
     n: int
@@ -120,7 +120,7 @@ class Dosed:
 
 
 def feeds_by(row: Mapping[str, Any]) -> str:
-    """Return the pump that an intent feeds by. Raises: ValueError for one that there is not."""
+    """Return the pump that feeds by an intent. Raises: ValueError for an unknown pump."""
     pump = str(row.get("feed_pump", "Pump1"))
     if pump not in FEEDS:
         raise ValueError(f"feed_pump {pump}")
@@ -128,14 +128,13 @@ def feeds_by(row: Mapping[str, Any]) -> str:
 
 
 def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
-    """Every dose of a journal with what it really gave, and what the device repeated of it, in the order of time.
+    """List every dose of a journal with the volumes it really gave, and its repetitions, in order of time.
 
-    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; a
-    resumed run's `dose_end` tells what was repeated of it. Raises: RecordingError for a row that is not as the driver
-    wrote it.
+    A dose whose feed pump was never switched on gave nothing. A dose without a recorded end counts in full; the
+    `dose_end` of a resumed run has its repetitions. Raises: RecordingError for a damaged row.
     """
     given: dict[int, Dosed] = {}  # by the row of the intent
-    begun: dict[str, Dosed] = {}  # by reactor, the one that has not ended
+    begun: dict[str, Dosed] = {}  # by reactor, the dose that has not ended
     repeated: list[Dosed] = []
     for row in rows:
         if (kind := row.get("kind")) not in ("intent", "feed_on", "dose_end", "given"):
@@ -164,6 +163,6 @@ def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
 
 
 def damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
-    """Build the error of a row that is not as a driver writes it."""
+    """Build the error for a damaged row."""
     what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
     return RowDamaged(path="journal.jsonl", what=what)

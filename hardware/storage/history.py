@@ -1,4 +1,4 @@
-"""What a run remembers of a reactor, of whatever family, and how the rows of its journal give it back after a crash."""
+"""State that a run keeps of a reactor of any family, and its recovery from the journal's rows after a crash."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -10,14 +10,14 @@ from hardware.storage.doses import damaged
 
 @dataclass(frozen=True)
 class History:
-    """One reactor's past; a family adds what it needs beside.
+    """One reactor's past; a family adds further fields.
 
-    sample: key of the last sample that a dose was decided for. carry_ml: put off to the next dose. doses: how many were
-      begun. temperature: of the thermostat, degC. handed_over: OD at which the reactor was handed over to the device's
-      own regulation, nan if it was not. seen_s: run time of the newest row, s.
-    open: a dose was begun and its end is not on record. Then feed_ml, waste_ml are its volumes as planned; on_s, run
-      time at which it was intended, or, once it was fed, at which its feed pump was asked on; fed, whether that was;
-      wasted, whether its waste pump was.
+    sample: key of the last sample for which a dose was decided. carry_ml: volume kept for the next dose, mL. doses:
+      number of doses begun. temperature: thermostat target, degC. handed_over: OD at which the reactor was handed over
+      to the device's own regulation, nan if it was not. seen_s: run time of the newest row, s.
+    open: a dose was begun and its end is not on record. feed_ml, waste_ml: planned volumes of the open dose, mL. fed,
+      wasted: its feed pump, its waste pump was commanded on. on_s: run time of its intent or, once fed is true, of the
+      feed pump's command, s.
     """
 
     sample: tuple[float, int] | None = None
@@ -37,7 +37,7 @@ class History:
     KEYS: ClassVar[Mapping[str, Callable[[Any], Any]]] = {"carry_ml": float, "doses": int, "temperature": float}
 
     def after(self, row: Mapping[str, Any]) -> Self:
-        """Return what is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
+        """Return the history after one more row of this reactor. Raises: errors of a damaged row, see `replay`."""
         kind = row["kind"]
         if kind not in self.KINDS:
             return self

@@ -1,4 +1,4 @@
-"""Append-only journal of a run: JSON lines, each on disk before the call returns, a torn last line cut on reopening."""
+"""Append-only journal of a run in JSON lines: each is on disk when `append` returns; reopening cuts a partial line."""
 
 import fcntl
 import json
@@ -21,7 +21,7 @@ LANDMARKS = tuple(
     f'"kind":"{kind}"'.encode()
     for kind in ("device", "temperature", "regulate", "overflow_pump", "level", "share", "bottle", "start")
 )
-"""Identities, blanks, targets, hand-overs, overflow pumps, levels, counted shares, bottles, starts: valid for days."""
+"""Kinds of rows that stay valid for days: identities, targets, hand-overs, levels, counted shares, bottles, starts."""
 
 
 def plain(value: Any) -> Any:
@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 def _complete(data: bytes) -> int:
-    """Length of `data` up to the end of its last whole row: a line that ends and that is a JSON object."""
+    """Return the length of `data` up to the end of its last whole row: a JSON object with a newline."""
     end = data.rfind(b"\n") + 1
     while end > 0:
         start = data.rfind(b"\n", 0, end - 1) + 1
@@ -47,12 +47,12 @@ def _complete(data: bytes) -> int:
                 return end
         except ValueError:
             pass
-        end = start  # a power cut can leave a whole line of zeros, too
+        end = start  # a power cut can leave a line of zeros with its newline
     return 0
 
 
 def _tail(path: Path, before: int) -> bytes:
-    """Read the file from byte `before` on, from the next line on unless it is 0."""
+    """Read the file from byte `before`, or, if that is not 0, from the next line."""
     with path.open("rb") as f:
         f.seek(before)
         if before:
@@ -61,8 +61,8 @@ def _tail(path: Path, before: int) -> bytes:
 
 
 def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
-    """Yield LANDMARKS of the first `before` bytes and, of each reactor whose dose is open there, its rows since."""
-    kept: dict[int, bytes] = {}  # by where they begin
+    """Yield, from the first `before` bytes, the rows of LANDMARKS and, for a dose still open there, all its rows."""
+    kept: dict[int, bytes] = {}  # by position
     dose: dict[bytes, dict[int, bytes]] = {}
     at = 0
     with path.open("rb") as f:
@@ -87,14 +87,14 @@ def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
 class Journal:
     """One row per event: {"n": number, "wall": s since 1970, "mono": s, "kind": ..., fields...}.
 
-    Rows are written with one write call and one fsync, so a row that `append` returned from survives a kill at once, a
-    power cut, and a full disk. Kinds and fields belong to whoever writes them.
+    Each row is written with one write call and one fsync: once `append` has returned, the row survives a kill, a power
+    cut and a full disk. The callers define kinds and fields.
 
-    Args: wall: clock of the day; only ever for the record and for the position of a resumed run. fsync: False leaves
-      the flushing to the operating system: survives a kill, not a power cut (simulated runs).
-    Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
-      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, doses left open, and the last 20 MB;
-      next_row, the number the next row will have.
+    Args: wall: wall clock, used only for the record and for the time of a resumed run. fsync: False leaves the flushing
+      to the operating system: rows survive a kill, but no power cut (simulated runs).
+    Attributes: cut: bytes of an incomplete last line, removed on opening. rows: the rows found on opening: all of a
+      file up to 20 MB, else the first row, the rows of LANDMARKS, open doses, and the last 20 MB. next_row: number of
+      the next row.
     Raises: RecordingError if the file cannot be opened, read or written, or another program writes to it.
     """
 
@@ -129,7 +129,7 @@ class Journal:
         self._size = kept
 
     def append(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
+        """Write one row. Raises: RecordingError if the row is not completely on disk; no partial row stays."""
         if self._file is None:
             raise messages.NotWritten(path=self.path, why="written to after it was closed")
         self._count_interrupted()
@@ -148,7 +148,7 @@ class Journal:
             raise messages.NotWritten(path=self.path, why=error.strerror or error) from error
 
     def _count_interrupted(self) -> None:
-        """Count a row that a stop interrupted after its write; cut what was written of one in part."""
+        """Count a row whose `append` was interrupted after its write; cut a partial row."""
         assert self._file is not None
         if os.fstat(self._file).st_size > self._size:
             more = _tail(self.path, max(self._size - 1, 0))
@@ -159,7 +159,7 @@ class Journal:
                 os.ftruncate(self._file, self._size)
 
     def reread(self) -> list[dict[str, Any]]:
-        """Its newest rows, 20 MB of them, as they are on the disk now. Raises: RecordingError."""
+        """Read the newest rows, up to 20 MB, from the disk. Raises: RecordingError."""
         try:
             newest = _tail(self.path, max(self.path.stat().st_size - TAIL, 0))
         except OSError as error:
@@ -193,7 +193,7 @@ def _check(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """All whole rows, oldest first, and how many bytes of a torn last line follow them. Raises: RecordingError."""
+    """Read all whole rows, oldest first, and count the bytes of an incomplete last line. Raises: RecordingError."""
     try:
         data = path.read_bytes()
     except OSError as error:

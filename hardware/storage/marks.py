@@ -1,4 +1,4 @@
-"""Marks of a run: what somebody did at the bench and when, beside the recordings of the run."""
+"""Marks of a run: what somebody did or measured at the bench, and when, in a file beside the recordings."""
 
 import csv
 import fcntl
@@ -20,10 +20,10 @@ COLUMNS = ("time_min", "reactor", "text", "written", *MEASURED)
 
 @dataclass(frozen=True)
 class Mark:
-    """What happened at minute `time_min` of a run to `reactor`; "" is all of them.
+    """An action or a measurement at minute `time_min` of a run, of `reactor`; "": all reactors.
 
-    level_ml: volume in its vial then. share, sd: of the second species, counted in a sample of then. bottle_ml: what
-    its bottle was filled to. None: nobody did.
+    level_ml: volume in the vial, mL. share, sd: share of the second species in a sample, and its standard deviation.
+    bottle_ml: volume in the bottle after a refill, mL. None: not measured.
     """
 
     time_min: float
@@ -40,7 +40,7 @@ class Mark:
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
-    """Append a mark to a run folder, on the disk when this returns; the run takes it over. Raises: RecordingError."""
+    """Append a mark to a run folder; it is then on the disk, and the run reads it. Raises: RecordingError."""
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with _alone(folder), Recorder(folder / NAME, COLUMNS) as file:
         cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, *(getattr(mark, key) for key in MEASURED))
@@ -59,13 +59,13 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def read_marks(folder: Path) -> list[Mark]:
-    """Read the marks of a run folder, as they were written; none where there is no file. Raises: RecordingError."""
+    """Read the marks of a run folder in the order written, none if there is no file. Raises: RecordingError."""
     path = folder / NAME
     if not path.is_file():
         return []
     try:
         text = path.read_text(encoding="utf-8")
-        whole = io.StringIO(text[: text.rfind("\n") + 1], newline="")  # what is torn is not there, and comes again
+        whole = io.StringIO(text[: text.rfind("\n") + 1], newline="")  # an incomplete last line is read later
         found = [
             Mark(float(r["time_min"]), r["reactor"], r["text"], *(float(r[c]) if r.get(c) else None for c in MEASURED))
             for r in csv.DictReader(whole)

@@ -18,13 +18,13 @@ Value = float | int | str | bool | None
 
 
 class Recorder(AbstractContextManager["Recorder"]):
-    """Append-only CSV writer: what `write` returned from is on the disk.
+    """Append-only CSV writer: a row is on the disk when `write` returns.
 
-    Each row is one `write` on an O_APPEND descriptor, then fsync. An existing file is continued: a last line torn by a
-    crash is cut off and reported in `repaired`.
+    Each row is one `write` on an O_APPEND descriptor, then fsync. An existing file is continued: an incomplete last
+    line after a crash is cut off and reported in `repaired`.
 
     Args: columns: unique names with their unit. fsync: False leaves rows in the operating system's cache (simulations
-      that can be repeated). remedy: what to do about a file that is another one.
+      that can be repeated). remedy: the remedy in the error for an existing file that is not this recording.
     Raises: RecordingError if the file cannot be opened or has another header; ValueError for unusable column names.
     """
 
@@ -56,7 +56,7 @@ class Recorder(AbstractContextManager["Recorder"]):
         self._append(_csv_line([_cell(row[c]) for c in self.columns]))
 
     def amend(self, row: Mapping[str, Value]) -> None:
-        """Put `row` in the place of the last one. A crash in between loses that row. Raises: as `write`."""
+        """Replace the last row by `row`. A crash during this loses the row. Raises: as `write`."""
         content = self.path.read_bytes()
         os.ftruncate(self._fd, content.rstrip(b"\n").rfind(b"\n") + 1)
         self.write(row)

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import yaml  # type: ignore[import-untyped]
 
-LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours have a tenth and a third of it
+LARGEST, DEEPEST = 200_000, 30  # bytes and levels; this project's YAML files have a tenth and a third of these
 
 
 def problem(error: Exception) -> str:
-    """Say what is wrong with a text and in which line, in one line."""
+    """Return one line that says what is wrong with a text and where."""
     mark = getattr(error, "problem_mark", None)
     if mark is not None and isinstance(error, yaml.MarkedYAMLError):
         return f"{error.problem} in line {mark.line + 1}"

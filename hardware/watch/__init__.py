@@ -1,5 +1,5 @@
-"""Reactors of the drivers' devices that are only read, beside whatever regulates them.
+"""Reactors that are only read, while another program regulates them.
 
-Nothing here can send a command: a Chi.Bio is asked by GET alone, a Pioreactor's broker is only listened to.
+Nothing here can send a command: a Chi.Bio gets only GET requests, a Pioreactor's broker only subscriptions.
 Entered by `deploy watch=true`.
 """

@@ -1,6 +1,6 @@
 """A Chi.Bio that is only read: one GET, whose reply has the sample and the feed pump's commands since the last one.
 
-The device shows the reactor that is selected in its web page. To select one is a command, so it is not done.
+The device shows the reactor that is selected in its web page. A selection is a command, so this program selects none.
 """
 
 import json
@@ -21,11 +21,11 @@ from hardware.watch import messages
 from hardware.watched import Watched
 
 AGAIN_S = 20.0  # from one `measure` without a sample to the next
-CYCLE_S = 56.0  # sooner no sample follows another
+CYCLE_S = 56.0  # shortest time between two samples
 
 
 class WatchedChiBio(Watched):
-    """One reactor that the device or somebody regulates, read by `get` every poll_s; flow_ml_s: of its feed pump."""
+    """One reactor that something else regulates, read by `get` every poll_s. Args: flow_ml_s: flow of the feed pump."""
 
     def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float, poll_s: float) -> None:
         super().__init__((name,))

@@ -1,4 +1,4 @@
-"""A kind of reactor that is only watched: opened and checked by reading."""
+"""A family of reactors that are only watched: opened and checked by reads."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -23,7 +23,7 @@ KINDS = ("chibio", "pioreactor")
 
 
 class WatchedFamily(Family):
-    """The reactors of another family, which cannot act. Args: of: that family."""
+    """Family that can only read the reactors of another family. Args: of: the other family."""
 
     at_stake = False
 

@@ -1,4 +1,4 @@
-"""Pioreactors that are only listened to: readings and dosing events, as the broker of the cluster passes them on."""
+"""Pioreactors that are only watched: readings and dosing events from the broker of their cluster."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ SILENT_S = 45.0  # without a reading
 
 
 class WatchedPioreactors(Watched):
-    """Units that somebody else's jobs regulate. `close` after use. Raises: LinkError if the broker does not answer."""
+    """Units that another client's jobs regulate. `close` after use. Raises: LinkError if the broker does not answer."""
 
     def __init__(self, config: PioreactorConfig, real: Clock, bench: Bench) -> None:
         super().__init__(config.reactors)

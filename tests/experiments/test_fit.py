@@ -55,7 +55,7 @@ def test_what_fits_is_taken(tmp_path: Path) -> None:
         ({"scenario": replace(CALM, outputs=("pump3 2 mL/h", None))}, "scenario.outputs of pio01: pump 3"),
         ({"scenario": WARMER, "backend": PioreactorConfig(thermostat=False)}, "30 to 37 degC: .* backend.thermostat"),
         ({"controller": registry.config("oracle")}, "oracle .* backend=pioreactor$"),
-        ({"backend": PioreactorConfig(max_dose_ml=0.9)}, "1.2 mL in a period of 60 s; give bench.max_rate=0.015 "),
+        ({"backend": PioreactorConfig(max_dose_ml=0.9)}, "1.2 mL in a period of 60 s; set bench.max_rate=0.015 "),
     ],
 )
 def test_what_a_backend_cannot_do_is_one_line(tmp_path: Path, values: dict[str, Any], words: str) -> None:
@@ -86,7 +86,7 @@ def test_a_large_pioreactor_runs_up_to_the_limit_of_its_vial(ml: float, tmp_path
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("pioreactor bench.volume_ml=36", "allowed less than the vendor's limit of its vial, 36"),
+        ("pioreactor bench.volume_ml=36", "allowed less than the vendor's limit of this vial, 36"),
         ("chibio bench.volume_ml=7", "bench.volume_ml = 7 mL of M0: allowed 10"),
         ("chibio bench.volume_ml=30", "bench.volume_ml = 30 mL of M0: allowed 10"),
         ("chibio backend.reactors=[M0,M1] bench.volumes_ml.M1=29.5", "one dose of 1.2 mL: allowed 0.5 mL"),

@@ -249,7 +249,7 @@ def test_a_signal_without_a_part_is_refused() -> None:
         ({"backend": UNIT}, "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube"),
         ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug acts by the pump 4; these reactors have feed pump"),
         ({"signals": {"drug": FOURTH}}, "signals.drug of M0: Pump4 has no tube"),
-        ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* beside signals.drug"),
+        ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* with signals.drug"),
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),
     ],
 )
@@ -310,7 +310,7 @@ def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_
     ("given", "refusal"),
     [
         (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence, by which"),
-        (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no pump [34] to spare; drop it"),
+        (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no spare pump [34]; remove it"),
         (["at_end=regulate"], "at_end = regulate: backend=evolver has no regulation of its own; allowed hold, stop"),
         (["controller=oracle"], "controller=oracle needs the exact state of a simulated plant"),
         (["backend.reactors=[a,b]"], "backend.reactors = .*: allowed 16 different names"),

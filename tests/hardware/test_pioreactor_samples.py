@@ -349,7 +349,7 @@ VOLUMES = {"pio02": 17.9, "pio03": 14.0}
         ({"period_s": 30.0, "max_rate": 0.05}, None),
         ({"volumes_ml": {"pio03": 18.0, "pio02": 36.0}}, r"= 36 mL of pio02: allowed less than .* vial, 36$"),
         ({"max_rate": 0.0251}, r"backend.max_dose_ml = 1.5 mL, the interlock allows 1.51 mL in a period of 60 s"),
-        ({"period_s": 90.0, "max_rate": 0.017}, r"1.53 mL in a period of 90 s; give bench.max_rate=0.01666 or"),
+        ({"period_s": 90.0, "max_rate": 0.017}, r"1.53 mL in a period of 90 s; set bench.max_rate=0.01666 or"),
     ],
 )
 def test_a_bench_is_such_as_units_may_have(bench, words):
