@@ -1,4 +1,4 @@
-"""Two species in one vial: their composition is estimated, held by the temperature, learned and compared.
+"""Two species in one vial: estimator, controllers, learning task and comparison of their composition.
 
-A guest: it enters by what the core lets anybody add (docs/extending.md), and nobody imports it.
+This package is a guest: it registers itself as any extension can (docs/extending.md); the core does not import it.
 """

@@ -1,10 +1,10 @@
-"""What the page of a run with two species lacks."""
+"""Reason why the page of a run with two species has no comparison with a growth model."""
 
 from experiments.record.aftermath import INCOMPARABLE
 
 INCOMPARABLE.append(
     lambda config: (
-        "the growth of two species follows their share, and the model is of one species"
+        "the growth of two species depends on their composition, but the model has one species"
         if config.get("composition")
         else ""
     )

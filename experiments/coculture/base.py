@@ -1,4 +1,4 @@
-"""What a composition controller gets and returns: N cultures in, N thermostat targets out."""
+"""Inputs of composition controllers: estimate and setpoint of the share, for N cultures."""
 
 from dataclasses import dataclass, fields
 
@@ -9,19 +9,19 @@ from experiments.laws.base import Array as Array
 from experiments.laws.base import Mask as Mask
 
 SHARE = "share"
-"""The signal, by which its laws are known."""
+"""Name of the signal under which its controllers are registered."""
 SEEN = ("logit_share", "temperature", "rate", "logit_setpoint")
 SEEN_AHEAD = (*SEEN, "logit_next", "minutes_to_change")
-"""Observation of a learned controller (envs/coculture/task.py), and with announced changes; it returns degC."""
+"""Observations of learned controllers (envs/coculture/task.py): without and with announced changes."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShareEstimate:
-    """Estimate of N cultures.
+    """Estimate of N cultures (docs/coculture.md, Estimate); arrays (N,).
 
-    logit: of the share r of the second species. sd: of that logit. temperature: of the vial, degC. rate: lagged growth
-    rate m_p of the second species, 1/h. error_e, error_p: relative, of the growth curves. thermometer: true less
-    measured temperature, degC. Each of shape (N,). Source: docs/coculture.md, Estimate.
+    logit: logit of the share r of the second species. sd: standard deviation of this logit. temperature: true vial
+    temperature, degC. rate: lagged growth rate m_p of the second species, 1/h. error_e, error_p: relative errors of
+    both species' growth curves. thermometer: true minus measured temperature, degC.
     """
 
     logit: Array
@@ -37,26 +37,26 @@ class ShareEstimate:
 
     @property
     def errors(self) -> Array:
-        """Of both growth curves, (N, 2)."""
+        """Relative errors of both growth curves, (N, 2)."""
         return np.stack([self.error_e, self.error_p], axis=-1)
 
     @property
     def share(self) -> Array:
-        """Compute r = 1 / (1 + exp(-logit)), (N,)."""
+        """Share r = 1 / (1 + exp(-logit)), (N,)."""
         return 1.0 / (1.0 + np.exp(-self.logit))
 
     @property
     def state(self) -> Array:
-        """Columns as in `envs/coculture/task.py`: logit, temperature, rate, (N, 3)."""
+        """State of the task in `envs/coculture/task.py`: logit, temperature, rate, (N, 3)."""
         return np.stack([self.logit, self.temperature, self.rate], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """What the program asks for.
+    """Setpoints of the share in N programs; arrays (N,).
 
-    setpoint: share in force, nan where none is (then the schedule's temperature holds). following: the next one that is
-    announced, else the present one. minutes: until then, 0 where none is announced. Each of shape (N,).
+    setpoint: current share, nan without one (then the schedule's temperature is used). following: the next setpoint if
+    it is announced, else the current one. minutes: time until the next setpoint, 0 if it is not announced.
     """
 
     setpoint: Array

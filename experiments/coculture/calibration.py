@@ -1,4 +1,4 @@
-"""Factor and offset of a light sensor from two known cultures (docs/coculture.md, Calibration of the sensor)."""
+"""Calibration of a light sensor with medium and a known culture (docs/coculture.md, Calibration of the sensor)."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ OD_TERM = CompositionEstimatorConfig().od_term
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """k and o of a reading FL = k (f + 150 OD) + o with their sds: the keys of `composition.estimator`; o in counts."""
+    """Factor k and offset o (counts) of a reading FL = k (f + 150 OD) + o with their sds; keys of the estimator."""
 
     factor: float
     factor_sd: float
@@ -33,26 +33,26 @@ def calibrate_sensor(
     growth_cv: float = 0.05,
     pair: PairConfig | None = None,
 ) -> SensorCalibration:
-    """Calibrate on medium alone, and on a culture held at one temperature and density until its pigment is in balance.
+    """Calibrate a sensor with readings of medium, and of a culture in balance at constant temperature and density.
 
       o = mean(blank),   k = mean((FL - o) / OD) / L,   L = share g(T) / D + 150
 
-    where D is the dilution rate that holds the density, which is the growth rate, and g the production of pigment.
-    The sds follow from the scatter of the readings and from `share_sd` and `growth_cv` to first order.
+    D is the dilution rate at constant density, which equals the growth rate, and g the production of pigment. The sds
+    are first-order and follow from the scatter of the readings, `share_sd` and `growth_cv`.
 
     Args:
       blank: readings of sterile medium, counts, (B,), two or more.
       light, od: readings of the culture, counts and OD, (K,) each, two or more.
-      temperature: that of the culture, degC, since three hours or more.
-      share: of the second species, 1 for a pure culture, with its sd. growth: 1/h, as dosed; None: the curve's at that
-        temperature; growth_cv: its relative sd.
-    Raises: ValueError naming what is wrong, its value and what is allowed.
+      temperature: temperature of the culture for at least three hours, degC.
+      share, share_sd: share of the second species (1: a pure culture), and its sd. growth: growth rate, 1/h, from the
+        doses; None: from the growth curve at this temperature. growth_cv: relative sd of the growth rate.
+    Raises: ValueError with argument, value and allowed values.
     """
     dark, bright, dense = (np.asarray(a, dtype=np.float64) for a in (blank, light, od))
     for name, given in (("blank", dark), ("light", bright), ("od", dense)):
         require(given.ndim == 1 and given.size > 1, f"{name} readings", given.size, "two or more")
         require(
-            bool(np.isfinite(given).all()), f"{name} readings", "nan or inf", "finite numbers; leave broken ones out"
+            bool(np.isfinite(given).all()), f"{name} readings", "nan or inf", "finite numbers; remove invalid readings"
         )
     require(bright.size == dense.size, "light readings", bright.size, f"as many as of OD, {dense.size}")
     require(bool((dense > 0.0).all()), "smallest od", float(dense.min()), "greater than 0")

@@ -1,4 +1,4 @@
-"""Figures of two species: curves, a run with a composition, and episodes of a training."""
+"""Figures of two species: growth curves, a run that controls the composition, and episodes of a training."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,10 +26,10 @@ def episodes(
     best_temperature: Array,
     species: str,
 ) -> Figure:
-    """Draw noise-free episodes, a column each: share with setpoint and optimum, chosen temperatures.
+    """Draw noise-free episodes, one column each: share with setpoint, and thermostat targets; policy and optimum.
 
-    Args: hours: (K,). wanted, learned, best: shares, (K, G). temperature, best_temperature: targets, degC, (K, G).
-      species: whose share it is.
+    Args: hours: (K,). wanted, learned, best: setpoint, share of the policy, share of the optimum, (K, G).
+      temperature, best_temperature: targets of policy and optimum, degC, (K, G). species: name of the second species.
     """
     columns = wanted.shape[1]
     figure, axes = new_figure(2.6 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
@@ -48,7 +48,7 @@ def episodes(
 
 
 def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
-    """Share of a species with its setpoint and the estimate's 95 % band, temperature, OD, pump and light of a run."""
+    """Draw a run: share with setpoint and 95 % band, temperature, OD, pump rate and fluorescence."""
     figure, axes = new_figure(8.0, 9.0, 5, 1, sharex=True, height_ratios=[2.4, 1.2, 1.0, 0.8, 1.0])
     share, heat, density, pump, light = axes
     columns = {**table.columns, "od": table.od(), "setpoint": table.setpoints()}
@@ -92,7 +92,7 @@ def composition_figure_of(table: Recordings, scenarios: Sequence[Scenario], spec
 
 
 def _announced(own: Mapping[str, Array], scenario: Scenario) -> tuple[Array, Array]:
-    """Minutes and values of changes that a reactor's run announced; it may end before."""
+    """Return minutes and setpoints of the announcements in a reactor's run, up to its last sample."""
     began = np.nanmin(own["time_min"] - own["elapsed_min"], initial=np.inf)
     minute, share = program_of(scenario).announcements(scenario.announced_min)
     known = minute + began <= np.nanmax(own["time_min"], initial=-np.inf)
@@ -100,7 +100,7 @@ def _announced(own: Mapping[str, Array], scenario: Scenario) -> tuple[Array, Arr
 
 
 def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure:
-    """Draw both curves with the recorded rates and 95 % intervals, their crossing, and the production of pigment."""
+    """Draw both growth curves with measured rates and 95 % intervals, their crossing, and the pigment production."""
     figure, (growth, pigment) = new_figure(7.5, 6.0, 2, 1, sharex=True, height_ratios=[2.0, 1.0])
     t = np.linspace(*pair.temperatures, 141)
     for k, (species, mine) in enumerate(zip((pair.first, pair.second), points, strict=True)):
@@ -109,7 +109,7 @@ def pair_figure(pair: PairConfig, points: Sequence[Sequence[Plateau]]) -> Figure
         sides = [[p.growth.value - p.growth.low for p in mine], [p.growth.high - p.growth.value for p in mine]]
         growth.errorbar(at, value, sides, linestyle="", marker="o", markersize=4.0, capsize=3.0, color=COLOURS[k])
     even = pair.even_c
-    growth.axvline(even, color="black", linewidth=0.8, linestyle=":", label=f"alike at {even:.2f} °C")
+    growth.axvline(even, color="black", linewidth=0.8, linestyle=":", label=f"equal growth at {even:.2f} °C")
     growth.set(ylabel="growth rate, 1/h", ylim=(0.0, None))
     growth.legend()
     pigment.plot(t, pair.production(t), color=COLOURS[1])

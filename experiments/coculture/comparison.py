@@ -1,4 +1,4 @@
-"""Comparison of controllers of the composition: their closed loops, numbers, figures and page."""
+"""Comparison of composition controllers: closed loops, numbers, figures and page."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,33 +40,32 @@ from experiments.reporting.tables import number
 from hardware.safety.config import SafetyConfig
 
 FACTOR_SD, OFFSET_SD = 0.02, 5.0
-"""Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
-FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # laws that act on what is announced
+"""Errors of a calibrated light sensor: relative sd of the factor; sd of the offset, counts, from 36 blank readings."""
+FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # controllers that use announcements
 COLUMNS = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
-"""Fields of a `ShareTrial` and the columns of a recording that they are."""
+"""Field of a `ShareTrial` -> column of a recording."""
 
 ERRORS = {"_mean": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
-SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
-STEP = 5  # minutes between the points of a share's curve
-LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
+SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # in a figure, if there are more than these
+STEP = 5  # minutes between two points of a curve
+LAST_MIN, DAY_MIN = 120, 1440  # minutes at the end of a window or run over which an error is averaged
 DEFINITIONS = {
-    "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
-    "for.",
-    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; the optimum knows "
-    "the whole program in either case.",
-    "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "
-    "5 counts; otherwise it begins from the mean of 17 real reactors.",
-    "paired": "law minus the vendor's PI, reactor by reactor: both meet the same vials, sensors and noise.",
-    "band covers": "share of all minutes in which the true share lies within the estimate's 95 % band.",
+    "error": "mean |r - setpoint| over all times with a setpoint; r is the true share of the second species.",
+    "with preview": "the controller uses announcements of the next setpoint, made announce_min before the change. The "
+    "optimum always knows the whole program.",
+    "calibrated": "the estimator knows each sensor's factor and offset with errors of 2 % and 5 counts; otherwise it "
+    "begins with the means of 17 real reactors.",
+    "paired": "controller minus the vendor's PI in the same reactor, that is with the same vial, sensors and noise.",
+    "band covers": "fraction of all minutes in which the true share is inside the estimate's 95 % band.",
 }
 
 
 @dataclass(frozen=True)
 class ShareCell(Cell):
-    """A loop of a share.
+    """Names of a closed loop that controls the share.
 
-    density: the controller that holds the OD beside it; announced: its changes are told ahead, as the scenario has it;
-    calibrated: the light sensor was, with its errors.
+    density: controller of the density. announced: whether changes of the share's setpoint are announced as in the
+    scenario. calibrated: whether the light sensor is calibrated, with the usual errors.
     """
 
     signal: str = SHARE
@@ -81,10 +80,10 @@ class ShareCell(Cell):
 
 @dataclass(frozen=True, eq=False)
 class ShareTrial(Trial):
-    """A share that was held, minute by minute; arrays (N, K).
+    """Trial of a composition controller, minute by minute; arrays (N, K).
 
-    foresight: the law knew of changes ahead. setpoint: (K,), nan where no share is asked for. share, od: true ones.
-    estimate, low, high: of the share and its 95 % band.
+    foresight: whether the controller used announcements. setpoint: setpoint of the share, (K,), nan without one.
+    share, od: true share and OD. estimate, low, high: estimated share and its 95 % band.
     """
 
     foresight: bool
@@ -102,7 +101,7 @@ class ShareTrial(Trial):
 
 
 def _run(config: BenchmarkConfig, cell: ShareCell, followed: Followed | None) -> ShareTrial:
-    """Run a trial in which one controller holds the share and another the density beside it."""
+    """Run a trial with one controller of the share and another of the density."""
     composition, policy = of_benchmark(config).compositions[cell.controller], followed[0] if followed else None
     scenario, pair = config.scenarios[cell.scenario], read_pair(of_benchmark(config).pair)
     schedule = scenario if cell.announced else replace(scenario, announce_min=0.0)
@@ -130,7 +129,7 @@ def _run(config: BenchmarkConfig, cell: ShareCell, followed: Followed | None) ->
 
 
 def _beside(config: BenchmarkConfig, name: str) -> Controller:
-    """Build the controller of the density beside a share. Raises: UserError for a policy that does not fit."""
+    """Build the controller of the density. Raises: UserError for a policy that does not fit."""
     kind, policy = config.controllers[name].kind, None
     if kind == "dqn":
         policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)
@@ -139,7 +138,7 @@ def _beside(config: BenchmarkConfig, name: str) -> Controller:
 
 
 def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
-    """Tell the estimator each reactor's factor and offset, with the errors that a calibration leaves."""
+    """Calibrate the estimator with each reactor's factor and offset, plus random errors of a usual calibration."""
     rng = np.random.default_rng([seed, 1])
     factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
     offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
@@ -147,7 +146,7 @@ def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
 
 
 def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Vials of the two species, and a temperature in every phase: by default that at which they grow alike."""
+    """Return the config with the pair's species in the vials, and a temperature in every phase, by default even_c."""
     pair = read_pair(of_benchmark(config).pair)
     scenarios = {name: resting(s, pair.resting_c) for name, s in config.scenarios.items()}
     plants = {name: of_pair(p, pair) if of_plant(p).second.present else p for name, p in config.plants.items()}
@@ -155,7 +154,7 @@ def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
-    """Load what each composition controller needs, if anything; the run folder keeps copies. Raises: UserError."""
+    """Load the policy of each composition controller, None without one; copy it into the folder. Raises: UserError."""
     found, two = dict[str, Followed | None](), of_benchmark(config)
     for name in names:
         kept = folder / "policies" / name
@@ -173,14 +172,14 @@ def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> 
 
 
 def abs_error(trial: ShareTrial, since: int = 0) -> Array:
-    """Mean |r - setpoint| from a minute on wherever a share is asked for, (N,)."""
+    """Return the mean |r - setpoint| over all times with a setpoint, (N,). Args: since: first minute."""
     return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, since:], axis=1))
 
 
 def last_hours(trial: ShareTrial) -> Array:
-    """Mean |r - setpoint| of the last 2 h of every window, (N,); nan where the share asked for changes all the time.
+    """Return the mean |r - setpoint| of the last 2 h of every window with a constant setpoint, (N,); nan without any.
 
-    A law that is told of a change leaves before it comes: then this says nothing of how well it holds.
+    A controller with preview leaves a setpoint before the change, so this does not measure how well it holds.
     """
     held, edges = np.zeros(trial.minute.size, dtype=np.bool_), trial.schedule.edges.astype(int)
     for start, end in pairwise(edges):
@@ -191,7 +190,7 @@ def last_hours(trial: ShareTrial) -> Array:
 
 
 def share_row(trial: ShareTrial) -> dict[str, Any]:
-    """Build the row of a share in summary.json, judged by the true share."""
+    """Build the row of a trial in summary.json; errors refer to the true share."""
     error, days = Spread(abs_error(trial)), trial.minute[-1] >= 2 * DAY_MIN
     inside = (trial.low <= trial.share) & (trial.share <= trial.high)
     return trial.names() | {
@@ -210,7 +209,7 @@ def share_row(trial: ShareTrial) -> dict[str, Any]:
 
 
 def shares(trials: Sequence[ShareTrial]) -> Figure:
-    """Draw a column per controller: true share, setpoint and the vials' temperature; median and middle 90 %."""
+    """Draw true share with setpoint, and vial temperature, a column per trial: median and middle 90 % of reactors."""
     columns = len(trials)
     figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
     for k, trial in enumerate(trials):
@@ -228,7 +227,7 @@ def shares(trials: Sequence[ShareTrial]) -> Figure:
 
 
 def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """Error of every controller on every plant of one scenario: mean and 95 % interval."""
+    """Draw the error of every controller on every plant of a scenario: mean and 95 % interval."""
     labels = list(dict.fromkeys(law_of(e) for e in entries))
     marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
     handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
@@ -240,7 +239,7 @@ def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iterator[Drawing]:
-    """Two figures of every scenario in which a share is held: every law and plant; the shares on the first plant."""
+    """Draw two figures per scenario: errors of all controllers on all plants, and the shares on the first plant."""
     for scenario in dict.fromkeys(t.cell.scenario for t in trials):
         here = [t for t in trials if t.cell.scenario == scenario]
         plant = here[0].cell.plant
@@ -250,7 +249,7 @@ def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iter
         yield Drawing(
             f"composition_{scenario}_laws",
             share_errors([r for r in rows if (r["signal"], r["scenario"]) == ("share", scenario)]),
-            f"{scenario}: every law and plant",
+            f"{scenario}: every controller and plant",
             "Mean and 95 % interval over the reactors.",
         )
         yield Drawing(
@@ -285,15 +284,15 @@ def _section(out: Page, summary: Row, run: Path) -> None:
             measure = Measure(key, f"Mean |r - setpoint|{when}", partial(scaled, key=key), note, key)
             add([r for r in rows if r[key] is not None], measure)
         add(summary["paired"], Measure("paired", "Difference to the vendor's PI", _lower, note))
-        title = "Error of the estimate (rms), and how much its band covers"
+        title = "Error of the estimate (rms), and coverage of its 95 % band"
         add(rows, Measure("estimate", title, _estimate, note, folded=True))
-        add(rows, Measure("od", "OD: least, mean, largest", _od, note, folded=True))
+        add(rows, Measure("od", "OD: smallest, mean, largest", _od, note, folded=True))
         for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
             out.figure(run / f["file"], f["title"], f["caption"])
 
 
 def _split(study: StudyConfig, cell: Cell) -> list[Cell]:
-    """List a loop for each composition controller, beside which the controller of the cell holds the density."""
+    """List a loop for each composition controller of a study, each with the density controller of the cell."""
     two = of_study(study)
     beside = cell.controller, two.announced, two.calibrated
     return [ShareCell(law, cell.plant, cell.scenario, SHARE, *beside) for law in two.compositions]

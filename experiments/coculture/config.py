@@ -1,4 +1,4 @@
-"""What two species add to the configs of the core, and the files that these name."""
+"""Settings that two species add to the core's configs, and functions that read the files named there."""
 
 import logging
 from dataclasses import replace
@@ -33,7 +33,7 @@ class OfDeploy:
 
     composition: Any = setting(
         None,
-        "controller of the temperature if the scenario has a composition: a preset of `composition`; null: none",
+        "composition controller, a preset of `composition`; null: midpoint if the scenario has a composition",
         kinds=registry.config_at,
     )
     composition_policy: str = setting(
@@ -41,7 +41,7 @@ class OfDeploy:
         "policy of composition=dqn and dqn_preview: `shipped`, a policy.npz, or the run folder of a training or "
         "deployment",
     )
-    share_warnings: ShareWarnings = part(ShareWarnings, "warnings of a composition out of control")
+    share_warnings: ShareWarnings = part(ShareWarnings, "when to warn that the composition is out of control")
     pair: str = setting(
         USUAL, "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
     )
@@ -58,12 +58,12 @@ class OfTrain:
 
     pair: str | None = setting(
         None,
-        "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",
+        "two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder; null: env.pair",
     )
 
     def __post_init__(self) -> None:
         of_two = isinstance(cast(TrainConfig, self).env, CocultureConfig)
-        allowed = "null for a task of one species; give env=coculture_preview beside it"
+        allowed = "null for a task of one species; to train with two species, add env=coculture_preview"
         require(self.pair is None or of_two, "pair", self.pair, allowed)
 
 
@@ -71,10 +71,10 @@ class OfStudy:
     """Two-species options of a study of `benchmark`."""
 
     compositions: tuple[str, ...] = setting(
-        (), "names of composition controllers; `controllers` then control the density beside each of them"
+        (), "names of composition controllers; each is combined with every controller of the density"
     )
-    announced: bool = setting(True, "composition: announce changes in advance, as the scenario says")
-    calibrated: bool = setting(False, "composition: each reactor has a calibrated light sensor")
+    announced: bool = setting(True, "whether changes of the share's setpoint are announced as in the scenario")
+    calibrated: bool = setting(False, "whether each reactor's light sensor is calibrated")
 
 
 class OfBenchmark:
@@ -92,17 +92,22 @@ class OfBenchmark:
         config = cast(BenchmarkConfig, self)
         learned = [k for k, c in self.compositions.items() if registry.takes(c.kind, "policy", SHARE)]
         for name in self.composition_policies:
-            require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")
+            require(
+                name in learned,
+                "composition_policies",
+                name,
+                ", ".join(learned) or "none, because no controller uses a policy",
+            )
         of_two = {name: study for name, study in config.studies.items() if of_study(study).compositions}
         same = len(of_two) in (0, len(config.studies))
-        require(same, "studies", ", ".join(config.studies), "all with compositions, or none: their numbers differ")
+        require(same, "studies", ", ".join(config.studies), "studies that all have compositions, or all have none")
         asks = [key for key, s in config.scenarios.items() if composed(s)]
         plants = [key for key, p in config.plants.items() if of_plant(p).second.present]
         for name, study in of_two.items():
             for key, given, having, known in (
                 ("compositions", of_study(study).compositions, "", [*self.compositions]),
-                ("scenarios", study.scenarios, "those with ratios: ", asks),
-                ("plants", study.plants, "those with two species: ", plants),
+                ("scenarios", study.scenarios, "scenarios with ratios: ", asks),
+                ("plants", study.plants, "plants with two species: ", plants),
             ):
                 wrong = next((one for one in given if one not in known), None)
                 require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}{', '.join(known)}")
@@ -121,35 +126,35 @@ def of_deploy(config: DeployConfig) -> OfDeploy:
 
 
 def read_pair(name: str) -> PairConfig:
-    """Read a pair of species: a preset of conf/strains, or the pair.yaml of a calibration.
+    """Read two species from a preset of conf/strains, or from a pair.yaml or the run folder of `calibrate_pair`.
 
-    Raises: UserError naming the presets, or the file and what is wrong with it.
+    Raises: UserError with the known presets, or with the file and the reason.
     """
     with frame.refusing(ValueError):
         return named_pair(name)
 
 
 def completed(config: TrainConfig) -> TrainConfig:
-    """Put the growth curves and the pair that a training run's config names into its task. Raises: UserError."""
+    """Return a training config whose task has the pair and the growth curves (`env_file`). Raises: UserError."""
     pair, env = cast(OfTrain, config).pair, config.env
     if config.env_file is not None:
         env = read_curves(config.env_file, env)
-    if pair is not None and config.resume is None:  # a resumed run has it in env.pair
+    if pair is not None and config.resume is None:  # env.pair of a resumed run already has the species
         with frame.refusing(ValueError):
             env = replace(env, pair=read_pair(pair))
     return config if env is config.env else replace(config, env=env, env_file=None)
 
 
 def read_curves(run: str, env: CocultureConfig) -> CocultureConfig:
-    """Build a task of two species on the growth curves that a run has found, and with its pair.
+    """Return a task with the species of a deployment and the growth curves that it estimated last.
 
-    Args: run: folder of a deployment with one reactor that holds a share, or RUN/recordings/NAME.csv of one of several.
-    Raises: UserError naming what is missing.
+    Args: run: run folder of a deployment that controlled the share in one reactor, or, if in several reactors,
+      RUN/recordings/NAME.csv of one reactor. Raises: UserError naming what is missing.
     """
     path, wanted = Path(run), None
     if path.suffix == ".csv":
         path, wanted = path.resolve().parents[1], path.stem
-    remedy = "give the folder of a deployment that held a share, or RUN/recordings/NAME.csv of one of its reactors"
+    remedy = "give the folder of a deployment with composition control, or RUN/recordings/NAME.csv of one reactor of it"
     try:
         rows, _ = read_journal(path / "journal.jsonl")
         stored = files.load_yaml(path / "config.yaml")
@@ -162,13 +167,13 @@ def read_curves(run: str, env: CocultureConfig) -> CocultureConfig:
     }
     if wanted is None and len(newest) > 1:
         each = ", ".join(str(path / "recordings" / f"{name}.csv") for name in newest)
-        raise frame.UserError(f"env_file={run}: several reactors, each with curves of its own; give one of {each}")
+        raise frame.UserError(f"env_file={run}: several reactors with different growth curves; give one of {each}")
     if not newest or wanted not in (None, *newest):
-        raise frame.UserError(f"env_file={run}: it estimated no growth curves of two species; {remedy}")
+        raise frame.UserError(f"env_file={run}: no estimated growth curves of two species; {remedy}")
     name, why = (wanted, newest[wanted]) if wanted else next(iter(newest.items()))
     scales = [float(np.clip(1.0 + why[key], *SCALES)) for key in ("bias_e", "bias_p")]
-    known = [f"{scale:.3f} of the pair's" for scale in scales]
-    log.info("growth curves of %s, %s: %s and %s", path, name, *known)
+    known = [f"{scale:.3f} times" for scale in scales]
+    log.info("growth estimated in %s, %s: %s and %s that of the pair", path, name, *known)
     own = stored.get("pair") if isinstance(stored, DictConfig) else None
     pair = read_pair(str(path) if (path / FILE).is_file() else str(own or USUAL))
     with frame.refusing(ValueError):

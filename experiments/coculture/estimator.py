@@ -1,4 +1,4 @@
-"""What is known of two species in one vial: a Kalman filter on OD, fluorescence, temperature and doses."""
+"""Estimator of two species in one vial: a Kalman filter that uses OD, fluorescence, temperature and doses."""
 
 from dataclasses import dataclass
 
@@ -17,50 +17,50 @@ LOGIT, LOG_OD, LOG_F, LOG_Q, BIAS_E, BIAS_P, GAIN, FACTOR, OFFSET, THERMOMETER =
 STATES = 10
 OD, LIGHT, SAMPLE = range(3)  # kinds of readings
 DILUTED = slice(LOG_OD, LOG_Q)
-ERRORS_C = np.linspace(-1.0, 1.0, 5)  # of the thermometer, for which rates and production are followed side by side
-FORGET_MIN = 63.0  # production forgets where it began: s = -1.6 exp(-s/2) per hour has Re s = -.946
+ERRORS_C = np.linspace(-1.0, 1.0, 5)  # thermometer errors, degC, for which rates and production are computed
+FORGET_MIN = 63.0  # time constant of an initial error of production: s = -1.6 exp(-s/2) per hour has Re s = -.946
 LAGRANGE = np.linalg.inv(np.vander(ERRORS_C, increasing=True))
-DOSES = 60.0  # over which the spread of doses is judged
-LOWEST_OD = 0.005  # below it a first reading says nothing
-LOWEST_LIGHT = 1.0  # counts; what the logarithm of the pigment begins from at least
-ITERATIONS = 3  # of an update, about the newest estimate
+DOSES = 60.0  # number of doses in the average from which the spread of doses is estimated
+LOWEST_OD = 0.005  # a lower first reading is ignored
+LOWEST_LIGHT = 1.0  # counts; lowest fluorescence of the pigment at the start
+ITERATIONS = 3  # linearisations of an update
 LONGEST_STEP_MIN = 1.0
 
 
 @dataclass(frozen=True)
 class CompositionEstimatorConfig:
-    """Settings of the filter before its first reading.
+    """Settings of the filter: initial estimates, noise and gates.
 
-    Seventeen real reactors had factors of 0.75 to 1.19 and offsets of 151 to 339 counts (Lee et al., Cell Reports
-    Methods 5:101009, 2025, public model); their mean and spread are the defaults, which a calibration replaces
+    The defaults of the light sensor are mean and spread of 17 real reactors, with factors of 0.75 to 1.19 and offsets
+    of 151 to 339 counts (Lee et al., Cell Reports Methods 5:101009, 2025, public model). A calibration replaces them
     (docs/coculture.md, Calibration of the sensor).
     """
 
-    share: float = setting(0.5, "first guess of the share of P. putida", above=0.0, below=1.0)
-    share_sd: float = setting(1.8, "sd of its logit: 0.03 to 0.97 in 95 %", above=0.0, at_most=5.0)
-    starts: int = setting(5, "first guesses within that range, followed side by side", within=(1, 9))
+    share: float = setting(0.5, "initial share of the second species", above=0.0, below=1.0)
+    share_sd: float = setting(1.8, "sd of its logit (95 %: 0.03 to 0.97)", above=0.0, at_most=5.0)
+    starts: int = setting(5, "number of initial shares in this range, each with its own filter", within=(1, 9))
     bias_sd: float = setting(0.1, "sd of a growth curve's relative error", within=(0, 0.5))
-    bias_walk: float = setting(2e-4, "its random walk", "1/sqrt(min)", within=(0, 0.05))
+    bias_walk: float = setting(2e-4, "random walk of this error", "1/sqrt(min)", within=(0, 0.05))
     growth_sd: float = setting(3e-4, "spread of either species' growth within a minute", "1/sqrt(min)", within=(0, 0.1))
     pigment_sd: float = setting(1e-3, "spread of ln pigment within a minute", "1/sqrt(min)", within=(0, 0.1))
-    pigment_first_sd: float = setting(0.5, "sd of the first guess of ln (pigment over its balance)", within=(0.01, 5))
+    pigment_first_sd: float = setting(0.5, "sd of the initial ln (pigment / pigment in balance)", within=(0.01, 5))
     production_first_sd: float = setting(
-        0.5, "sd of the first guess of ln (production of pigment over what the temperature asks for)", within=(0, 5)
+        0.5, "sd of the initial ln (pigment production / steady production at this temperature)", within=(0, 5)
     )
-    thermometer_sd: float = setting(0.25, "sd of the true temperature less the measured one", "degC", within=(0, 1))
-    gain_sd: float = setting(0.05, "sd of the pump's true flow over the calibrated one", within=(0, 1))
-    gain_h: float = setting(24.0, "for so long the flow is estimated, then only its doubt counts", "h", at_least=0.0)
-    dose_cv: float = setting(0.1, "spread of a dose, at least", within=(0, 1))
-    od_sd: float = setting(0.005, "of an OD reading", "OD", within=(1e-4, 0.1))
-    fluorescence_sd: float = setting(30.0, "of a fluorescence reading", "counts", within=(0.1, 10_000))
-    od_term: float = setting(150.0, "light that cells of any kind scatter into the band", "counts/OD", within=(0, 5000))
+    thermometer_sd: float = setting(0.25, "sd of true minus measured temperature", "degC", within=(0, 1))
+    gain_sd: float = setting(0.05, "sd of the pump's true flow / calibrated flow", within=(0, 1))
+    gain_h: float = setting(24.0, "time during which the flow is estimated; then it stays uncertain", "h", at_least=0.0)
+    dose_cv: float = setting(0.1, "smallest relative spread of a dose", within=(0, 1))
+    od_sd: float = setting(0.005, "sd of an OD reading", "OD", within=(1e-4, 0.1))
+    fluorescence_sd: float = setting(30.0, "sd of a fluorescence reading", "counts", within=(0.1, 10_000))
+    od_term: float = setting(150.0, "light scattered by cells of both species", "counts/OD", within=(0, 5000))
     factor: float = setting(0.99, "k of the reading k (f + od_term OD) + offset", within=(0.05, 20))
-    factor_sd: float = setting(0.13, "its sd", within=(0, 5))
-    factor_walk: float = setting(0.005, "its relative random walk: lamp, optics, biofilm", "1/sqrt(day)", within=(0, 1))
-    offset: float = setting(214.0, "of the reading", "counts", within=(0, 20_000))
-    offset_sd: float = setting(45.0, "its sd", "counts", within=(0, 5000))
-    gate_sigma: float = setting(5.0, "a reading further off than this is an outlier ...", "sigma", within=(2, 20))
-    gate_max: int = setting(6, "... unless it is so many times in a row", "readings", within=(1, 100))
+    factor_sd: float = setting(0.13, "sd of factor", within=(0, 5))
+    factor_walk: float = setting(0.005, "relative random walk of factor", "1/sqrt(day)", within=(0, 1))
+    offset: float = setting(214.0, "offset of a reading", "counts", within=(0, 20_000))
+    offset_sd: float = setting(45.0, "sd of offset", "counts", within=(0, 5000))
+    gate_sigma: float = setting(5.0, "a reading with a larger innovation is an outlier", "sigma", within=(2, 20))
+    gate_max: int = setting(6, "this many outliers in a row are accepted", "readings", within=(1, 100))
 
     def __post_init__(self) -> None:
         check(self, "composition.estimator")
@@ -69,33 +69,34 @@ class CompositionEstimatorConfig:
 class CompositionEstimator:
     """Extended Kalman filter for the composition of N cultures.
 
-    State z = [x, ln S, ln f, d, b_e, b_p, g, k, o, c]: logit of the share of P. putida, OD of both species, pigment,
-    error of its production, errors of the two growth curves, true over calibrated flow of the pump, factor and offset
-    of the light sensor, true less measured temperature. With e = S/(1 + exp x) and p = S - e, and over h hours in which
-    v of V mL were replaced
+    State z = [x, ln S, ln f, d, b_e, b_p, g, k, o, c]: x logit of the second species' share, S OD of both species,
+    f fluorescence of the pigment, d error of ln production, b_e and b_p relative errors of both growth curves, g true /
+    calibrated flow of the pump, k and o factor and offset of the light sensor, c true minus measured temperature. With
+    e = S/(1 + exp x) and p = S - e, in h hours after a dose of v mL into a volume of V mL:
 
       x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p, k random walks
       ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - g v/V
       ln f <- ln(f + h q exp(d) p) - g v/V            d <- d exp(-h / 63 min)
       OD = S + noise                                  FL = k (f + 150 S) + o + noise
 
-    with m_e, m_p the curves' rates, 1/h, lagging the temperature by 2 and 60 min, and q the production of pigment,
-    whose delayed answer to temperature is known (docs/plant.md, Two species). All three are followed for five errors
-    of the thermometer side by side; at c they are the polynomial through these. In these coordinates the OD says
-    nothing of the share at once, however unsure that is; in ln e and ln p a linearised filter soon believes too much.
+    m_e and m_p are the curves' rates, 1/h, which lag the temperature by 2 and 60 min; q is the production of pigment
+    with its known delayed response to temperature (docs/plant.md, Two species). The filter computes m_e, m_p and q for
+    five thermometer errors and interpolates them at c by a polynomial. In these coordinates an OD reading alone does
+    not change the share, even if the share is uncertain; with ln e and ln p a linearised filter becomes overconfident.
 
-    An extended Kalman filter, iterated about the newest estimate (Bell, Cathey 1993), in Joseph's form. k and o are
-    considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but neither OD nor light
-    changes them, because in a week at one temperature nothing tells a sensor that drifts from a culture that does. So
-    is g after a day, for the same reason. A share that was counted (`sample`) changes all of them.
-    So wide a guess of the first share is too wide for one linearisation: `starts` filters begin within it, each weighs
-    as likely as it found the readings, and what is told is mean and variance of the mixture (Alspach, Sorenson 1972).
-    A reading further off than `gate_sigma` is left out, and with an OD the light beside it. Where it stays, the density
-    with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told; if
-    the OD shows that they spread more than `dose_cv`, so it is believed of those to come.
+    The filter iterates each update (Bell, Cathey 1993) and uses Joseph's form. It considers but does not estimate k
+    and o (Schmidt 1966): their uncertainty affects every gain, but OD and light do not change them, because in a week
+    at one temperature a drifting sensor and a drifting culture look alike. After `gain_h` the same applies to g. A
+    counted share (`sample`) changes k, o and g. The initial share is too uncertain for one linearisation, so `starts`
+    filters begin at different shares; their weights are the likelihoods of the readings, and the estimate is mean and
+    variance of the mixture (Alspach, Sorenson 1972).
 
-    State: mean (N, K, 10), cov (N, K, 10, 10) and log_weight (N, K) of K starts of each of N cultures.
-    Args: config: first guesses and noise. volume_ml: V, (N,) or one for all. pair: the two species.
+    A reading beyond `gate_sigma` is rejected; with an OD reading, the light of that sample is rejected, too. After
+    `gate_max` rejections in a row, OD and pigment (for light: the pigment) are reset, without an effect on the share.
+    Doses must be reported. If OD readings show a larger spread of doses than `dose_cv`, the filter uses the larger.
+
+    State: mean (N, K, 10), cov (N, K, 10, 10) and log_weight (N, K) of the K filters of each of N cultures.
+    Args: config: settings. volume_ml: V, (N,) or one for all. pair: the two species.
     """
 
     remembers = (
@@ -113,7 +114,7 @@ class CompositionEstimator:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """Forget everything; N cultures that have not been seen yet."""
+        """Reset the state for n cultures without readings."""
         c, shape = self.config, (n, self.config.starts)
         self.mean, self.log_weight = np.zeros((*shape, STATES)), np.zeros(shape)
         self.mean[..., GAIN], self.mean[..., FACTOR], self.mean[..., OFFSET] = 1.0, c.factor, c.offset
@@ -127,43 +128,43 @@ class CompositionEstimator:
         self._past = np.zeros((n, self.pair.pigment.delay_min, ERRORS_C.size))
 
     def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
-        """Each culture's own sensor, before its first reading: factor, its sd and offset, (N,) each; in counts."""
+        """Set each culture's sensor calibration, before its first reading: factor, its sd and offset, (N,) each."""
         self.mean[..., FACTOR], self.mean[..., OFFSET] = factor[:, None], offset[:, None]
         self.cov[..., FACTOR, FACTOR], self.cov[..., OFFSET, OFFSET] = factor_sd[:, None] ** 2, offset_sd**2
 
     @property
     def begun(self) -> Mask:
-        """Which cultures have been seen, (N,)."""
+        """Whether each culture has had a reading, (N,)."""
         return np.asarray(np.isfinite(self._minute))
 
     @property
     def since(self) -> Array:
-        """Minute of the newest readings, -inf before there are any, (N,)."""
+        """Minute of each culture's newest reading, -inf before its first, (N,)."""
         return np.where(self.begun, self._minute, -np.inf)
 
     @property
     def volumes_ml(self) -> Array:
-        """V of each culture, mL, (N,)."""
+        """Volume V of each culture, mL, (N,)."""
         return np.broadcast_to(np.asarray(self._volume_ml, dtype=np.float64), self._given_ml.shape)
 
     def dosed(self, volume_ml: Array) -> None:
-        """Fresh medium that went in since this was last called, mL, (N,)."""
+        """Add the fresh medium delivered since the last call, mL, (N,)."""
         self._given_ml = self._given_ml + volume_ml
 
     @property
     def given_ml(self) -> Array:
-        """Fresh medium since the newest readings, mL, (N,)."""
+        """Fresh medium delivered since each culture's newest reading, mL, (N,)."""
         return self._given_ml
 
     def gave(self, volume_ml: Array, rows: Mask) -> None:
-        """Set the volume delivered since the newest readings of `rows`, mL, (N,), in place of the earlier value."""
+        """Set the volume delivered since the newest reading of `rows`, mL, (N,)."""
         self._given_ml = np.where(rows, volume_ml, self._given_ml)
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Take the readings of `rows` that were not taken yet, each (N,).
+        """Update the estimates with the new readings of `rows`; arrays (N,).
 
-        Args: od; fluorescence: counts; temperature: degC; nan: none, or an invalid one, which is skipped.
-          minute: when they were taken, on any clock that only rises.
+        Args: od, fluorescence (counts), temperature (degC): readings, nan if missing or invalid. minute: time of the
+          readings, by a clock that never goes back.
         """
         new = rows & ~(minute <= self._minute)
         first = np.flatnonzero(new & np.isnan(self._minute) & (od > LOWEST_OD))
@@ -180,11 +181,11 @@ class CompositionEstimator:
         self._given_ml[seen] = 0.0
 
     def sample(self, share: Array, sd: Array, rows: Mask) -> None:
-        """Shares of P. putida that were counted just now, by plates or a cytometer, with their sds; each (N,).
+        """Update the estimates with shares of the second species counted in samples drawn now; arrays (N,).
 
-        What is known of the share is updated by r = 1 / (1 + exp(-x)) + noise, and through what x shares with them
-        the sensor, the flow and the growth curves. There is no gate: whoever counts says how well. Cultures that have
-        not been seen are left out.
+        The count is a reading r = 1 / (1 + exp(-x)) + noise. By correlation it also changes sensor, flow and growth
+        curves. No count is rejected. Cultures without a reading are skipped.
+        Args: share, sd: counted shares and their sds. rows: cultures with a count.
         """
         idx = np.flatnonzero(rows & self.begun & np.isfinite(share))
         reading, noise = share[idx], np.square(sd[idx])
@@ -194,7 +195,7 @@ class CompositionEstimator:
         self._update(idx, SAMPLE, reading, noise)
 
     def _begin(self, idx: Rows, od: Array, temperature: Array) -> None:
-        """First reading: its OD, the share as guessed, everything in balance with the temperature."""
+        """Start the rows `idx` at their first reading: its OD, the initial shares, pigment and rates in balance."""
         c, warm = self.config, np.where(np.isfinite(temperature), temperature, self.pair.even_c)
         self._temperature[idx] = warm
         each = warm[:, None] + ERRORS_C
@@ -213,7 +214,7 @@ class CompositionEstimator:
         self.cov[idx, :, LOG_F, LOG_F] += c.pigment_first_sd**2
 
     def _elapse(self, idx: Rows, minutes: Array, temperature: Array) -> None:
-        """Time passes in steps of at most a minute, temperature changes along a line, doses come at the beginning."""
+        """Predict the rows `idx` after `minutes`: in steps of at most 1 min, dose at the start, linear temperature."""
         before = self._temperature[idx]
         after = np.where(np.isfinite(temperature), temperature, before)
         steps = np.maximum(np.ceil(minutes / LONGEST_STEP_MIN - 1e-6), 1.0)
@@ -226,7 +227,7 @@ class CompositionEstimator:
         self._temperature[idx], self._dose[idx] = after, dose
 
     def _step(self, idx: Rows, minutes: Array, mean: Array, last: Array, dose: Array) -> None:
-        """One step. Args: mean, last: temperature in it and at its end, degC; dose: v/V."""
+        """Predict the rows `idx` by one step. Args: mean, last: mean and final temperature, degC. dose: v/V."""
         c, z, hours, dose = self.config, self.mean[idx], minutes / 60.0, dose[:, None]
         weight, change = _through(z[..., THERMOMETER])  # (n, K, errors of the thermometer)
         before, lag = self._lagged[idx], np.array([[self.pair.first.lag_min], [self.pair.second.lag_min]])
@@ -234,7 +235,9 @@ class CompositionEstimator:
         steady = self.pair.rates(each).swapaxes(1, 2)
         self._lagged[idx] = before + (steady - before) * -np.expm1(-minutes[:, None, None] / lag)
         curves = 0.5 * hours[:, None, None] * (before + self._lagged[idx])
-        grown, by_c = (np.einsum("nsc,nkc->nks", curves, w) for w in (weight, change))  # by the curves, and its slope
+        grown, by_c = (
+            np.einsum("nsc,nkc->nks", curves, w) for w in (weight, change)
+        )  # growth by the curves, and its slope
         errors = 1.0 + z[..., BIAS_E:GAIN]
         growth, by_c = grown * errors, by_c * errors
         share = 1.0 / (1.0 + np.exp(-z[..., LOGIT]))
@@ -245,7 +248,7 @@ class CompositionEstimator:
         made_at = np.maximum(made_at, self.pair.pigment.least)
         made = np.exp(z[..., LOG_OD] + 0.5 * growth[..., 1] - z[..., LOG_F] + z[..., LOG_Q])
         made *= hours[:, None] * made_at * share
-        new = made / (1.0 + made)  # share of the pigment that is of this step
+        new = made / (1.0 + made)  # fraction of the pigment that was made in this step
         fades = np.exp(-minutes / FORGET_MIN)[:, None]
         z[..., LOGIT] += growth[..., 1] - growth[..., 0]
         z[..., LOG_OD] += np.log(total) - z[..., GAIN] * dose
@@ -273,7 +276,7 @@ class CompositionEstimator:
         self._produce(idx, minutes, last)
 
     def _produce(self, idx: Rows, minutes: Array, temperature: Array) -> None:
-        """Production of pigment follows what the temperature asks for, less its own value half an hour ago."""
+        """Change the production by the steady production at this temperature minus its own delayed value."""
         now, past = self._production[idx], self._past[idx]
         pigment, steady = self.pair.pigment, self.pair.production(temperature[:, None] + ERRORS_C)
         wanted = now + pigment.follow_per_h / 60.0 * minutes[:, None] * (steady - past[:, 0])
@@ -281,7 +284,7 @@ class CompositionEstimator:
         self._production[idx] = np.maximum(wanted, pigment.least)
 
     def _seen(self, z: Array, which: int) -> tuple[Array, Array]:
-        """Return the expected reading of states (..., 10) and its slope (..., 10). Args: which: OD, LIGHT or SAMPLE."""
+        """Return the expected reading for states (..., 10), and its gradient (..., 10). which: OD, LIGHT or SAMPLE."""
         od, f, k = np.exp(z[..., LOG_OD]), np.exp(z[..., LOG_F]), z[..., FACTOR]
         slope = np.zeros_like(z)
         if which == OD:
@@ -297,7 +300,7 @@ class CompositionEstimator:
         return k * light + z[..., OFFSET], slope
 
     def _take(self, idx: Rows, which: int, reading: Array) -> None:
-        """Update with an OD or light; nan is skipped, and light beside an OD that was."""
+        """Update with OD or light readings; skip nan, outliers, and light of a sample whose OD was an outlier."""
         there = np.isfinite(reading)
         idx, reading = idx[there], reading[there]
         noise = (self.config.od_sd, self.config.fluorescence_sd)[which] ** 2
@@ -314,18 +317,18 @@ class CompositionEstimator:
         of, start = np.nonzero(stays)
         (self._density_anew, self._pigment_anew)[which](idx[of], start, reading[of])
         self._far[idx, :, which] = np.where(stays, 0, times)
-        usual = (self._weights()[idx] * (on & ~far)).sum(axis=1) > 0.5  # else the reading tells the starts nothing
+        usual = (self._weights()[idx] * (on & ~far)).sum(axis=1) > 0.5  # else the reading does not change the weights
         least = np.minimum(squared / spread, self.config.gate_sigma**2)
         self.log_weight[idx] -= 0.5 * usual[:, None] * (least + np.log(spread))
         self._update(idx, which, reading, np.full(idx.size, noise), on & ~far)
 
     def _weights(self) -> Array:
-        """Of the starts of each culture, (N, K), rows add up to 1."""
+        """Return the weights of each culture's filters, (N, K); each row adds up to 1."""
         weight = np.exp(self.log_weight - self.log_weight.max(axis=1, keepdims=True))
         return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
     def _dose_variance(self, idx: Rows) -> Array:
-        """(sd of a dose over its size)^2, (n, K): as configured, or more if the ODs say so."""
+        """Return (relative sd of a dose)^2, (n, K): the configured value, or the larger estimate from OD readings."""
         least = self.config.dose_cv**2
         known, sum_of = self._doses[idx, :, 0], self._doses[idx, :, 1]
         if least == 0.0:
@@ -333,11 +336,11 @@ class CompositionEstimator:
         return np.maximum(least, (least**-1 + sum_of) / (least**-2 + known))
 
     def _judge_dose(self, idx: Rows, squared: Array, spread: Array, od: Array, believed: Mask) -> None:
-        """Learn the spread of doses from an OD after a dose.
+        """Update the estimated spread of doses from an OD reading after a dose.
 
-        A squared error e^2 beyond what else explains it, over D = (OD v/V)^2, is an estimate of the squared spread with
-        variance 2 (E e^2)^2 / D^2. These are averaged by their precision, over some sixty doses, together with the
-        configured value, which counts as one whose sd is itself.
+        The excess of the squared error e^2 over its other causes, divided by D = (OD v/V)^2, estimates the squared
+        spread with variance 2 (E e^2)^2 / D^2. These estimates are averaged by precision over about 60 doses. The
+        configured value takes part as one estimate whose sd equals its value.
         """
         size = np.square(od * self._dose[idx][:, None])
         precision = np.square(size / spread) / 2.0
@@ -346,7 +349,7 @@ class CompositionEstimator:
         self._doses[idx] += given * (np.stack([precision, sum_of], axis=-1) - self._doses[idx] / DOSES)
 
     def _density_anew(self, idx: Rows, start: Rows, od: Array) -> None:
-        """Accept a density that jumped and stays; the pigment may have changed with it, as by an unrecorded dose."""
+        """Reset the density after a persistent jump; the pigment may have changed, too, as by an unrecorded dose."""
         found = np.log(np.maximum(od, LOWEST_OD))
         jump = found - self.mean[idx, start, LOG_OD]
         self.mean[idx, start, LOG_OD], self.mean[idx, start, LOG_F] = found, self.mean[idx, start, LOG_F] + jump
@@ -355,7 +358,7 @@ class CompositionEstimator:
         self.cov[idx, start, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
 
     def _pigment_anew(self, idx: Rows, start: Rows, light: Array) -> None:
-        """Attribute light that jumped and stays to the pigment."""
+        """Reset the pigment after a persistent jump of the light."""
         z, cov = self.mean[idx, start], self.cov[idx, start]
         k, scattered = z[:, FACTOR], self.config.od_term * np.exp(z[:, LOG_OD])
         f = np.maximum((light - z[:, OFFSET]) / k - scattered, LOWEST_LIGHT)
@@ -365,9 +368,9 @@ class CompositionEstimator:
         self.cov[idx, start, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
 
     def _update(self, idx: Rows, which: int, reading: Array, noise: Array, on: Mask | None = None) -> None:
-        """Update iteratively in Joseph's form, which holds for any gain; states that are only considered keep gain 0.
+        """Update the rows `idx` iteratively, in Joseph's form; states that are not estimated have gain 0.
 
-        Args: reading and variance of its noise, (n,). on: starts that learn from it, (n, K); None: all.
+        Args: reading, noise: reading and variance of its noise, (n,). on: filters to update, (n, K); None: all.
         """
         prior, cov, noise = self.mean[idx], self.cov[idx], noise[:, None]
         estimated = np.ones((idx.size, 1, STATES), dtype=np.bool_)
@@ -388,11 +391,11 @@ class CompositionEstimator:
         self.cov[idx] = kept @ cov @ kept.swapaxes(-1, -2) + noise[..., None, None] * _square(gain)
 
     def _mixed(self, of_starts: Array) -> Array:
-        """Mean over the starts of each culture, (N,), of values (N, K)."""
+        """Return each culture's weighted mean over its filters, (N,). Args: of_starts: values, (N, K)."""
         return np.asarray((self._weights() * of_starts).sum(axis=1))
 
     def estimate(self) -> ShareEstimate:
-        """Return estimated share, temperature and rates; before the first reading the first guess."""
+        """Return the estimate of the share and so on; before the first reading, the initial values."""
         z, mixed = self.mean, self._mixed
         logit, error = mixed(z[..., LOGIT]), mixed(z[..., THERMOMETER])
         variance = mixed(self.cov[..., LOGIT, LOGIT] + np.square(z[..., LOGIT] - logit[:, None]))
@@ -402,14 +405,14 @@ class CompositionEstimator:
         return ShareEstimate(logit, np.sqrt(np.maximum(variance, 0.0)), self._temperature + error, rate, *errors, error)
 
     def growth_errors(self) -> tuple[Array, Array]:
-        """Relative errors of both growth curves and their sds, (N, 2) each."""
+        """Return the relative errors of both growth curves and their sds, (N, 2) each."""
         both = self.mean[..., BIAS_E:GAIN]
         mean = np.stack([self._mixed(both[..., k]) for k in range(2)], axis=-1)
         inside = self.cov[..., [BIAS_E, BIAS_P], [BIAS_E, BIAS_P]] + np.square(both - mean[:, None])
         return mean, np.sqrt(np.stack([self._mixed(inside[..., k]) for k in range(2)], axis=-1))
 
     def explain(self) -> dict[str, Array]:
-        """Share with its 95 % band, errors of growth curves and thermometer, flow, density, pigment; each (N,)."""
+        """Return share with 95 % band, errors of growth curves and thermometer, flow, density, pigment; (N,) each."""
         now, (_, error_sds) = self.estimate(), self.growth_errors()
         low, high = (1.0 / (1.0 + np.exp(-now.logit - side * 1.96 * now.sd)) for side in (-1.0, 1.0))
         return {
@@ -429,12 +432,12 @@ class CompositionEstimator:
 
 
 def _square(a: Array) -> Array:
-    """Return a a', (..., S, S) of (..., S)."""
+    """Return the outer products a a', (..., S, S). Args: a: vectors, (..., S)."""
     return np.asarray(a[..., :, None] * a[..., None, :])
 
 
 def _starts(k: int) -> tuple[Array, float]:
-    """Where K starts stand and how wide each is, in sds of the guess that they make up together."""
+    """Return positions and width of k starts, in units of the sd that their mixture has."""
     if k == 1:
         return np.zeros(1), 1.0
     away = np.linspace(-1.0, 1.0, k)
@@ -443,7 +446,7 @@ def _starts(k: int) -> tuple[Array, float]:
 
 
 def _through(error: Array) -> tuple[Array, Array]:
-    """Weights of values at `ERRORS_C` in the polynomial through them at `error`, degC, (...), and in its slope."""
+    """Return weights that interpolate values at `ERRORS_C` by a polynomial at `error`, degC, and those of its slope."""
     at = np.clip(error, ERRORS_C[0], ERRORS_C[-1])[..., None]
     powers = np.arange(ERRORS_C.size)
     slope = powers * at ** np.maximum(powers - 1, 0)

@@ -1,4 +1,4 @@
-"""How two species enter: everything that the core lets a guest add, added here and nowhere else."""
+"""Registration of everything that two species add to the core."""
 
 from typing import Any
 
@@ -25,13 +25,13 @@ from hardware.family import family
 
 
 def _task(config: CocultureConfig) -> Any:
-    from experiments.coculture.task import Coculture  # torch, only where it is learned
+    from experiments.coculture.task import Coculture  # imports PyTorch, which only a training needs
 
     return Coculture(config)
 
 
 needs = "needs a policy; give policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
-plans = "plans the whole program; give a scenario with ratios"
+plans = "needs the whole schedule of shares; give a scenario with ratios"
 registry.hold(SHARE, "composition", {"policy": Part(missing=needs), "program": Part(missing=plans), "pair": Part()})
 for kind, config, law, parts in (
     ("dqn", laws.LearnedLawConfig, laws.LearnedLaw, ("policy", "pair")),
@@ -63,22 +63,22 @@ guests.add(TwoSpecies())
 curves.add(
     units={"coculture": "of the share"},
     curves={
-        "share/estimate": Curve("", "share of the second species as estimated"),
+        "share/estimate": Curve("", "estimated share of the second species"),
         "share/low": Curve("", "lower end of the estimate's 95 % band"),
         "share/high": Curve("", "upper end of the estimate's 95 % band"),
-        "share/setpoint": Curve("", "share asked for"),
-        "share/true": Curve("", "share in truth, which only a simulation knows"),
-        "share/fluorescence": Curve("counts", "fluorescence as measured"),
-        "controller/bias_e": Curve("", "relative error of the first species' growth curve, as estimated"),
-        "controller/bias_p": Curve("", "relative error of the second species' growth curve, as estimated"),
-        "controller/bias_e_sd": Curve("", "how unsure the first of these errors is, sd"),
-        "controller/bias_p_sd": Curve("", "how unsure the second of these errors is, sd"),
-        "controller/thermometer_error": Curve("degC", "true less measured temperature, as estimated"),
-        "controller/dose_spread": Curve("", "sd of a dose over its size, as estimated, at least as configured"),
-        "controller/dose_gain": Curve("", "dose over the dose that was asked for, as estimated"),
-        "controller/composition_od": Curve("OD", "density as the estimate of the share believes it"),
-        "controller/pigment": Curve("counts", "fluorescence of the pigment as estimated"),
-        "result/share_abs_error": Curve("", "mean error of the share, where one was asked for"),
+        "share/setpoint": Curve("", "setpoint of the share"),
+        "share/true": Curve("", "true share, in a simulation"),
+        "share/fluorescence": Curve("counts", "measured fluorescence"),
+        "controller/bias_e": Curve("", "estimated relative error of the first species' growth curve"),
+        "controller/bias_p": Curve("", "estimated relative error of the second species' growth curve"),
+        "controller/bias_e_sd": Curve("", "standard deviation of bias_e"),
+        "controller/bias_p_sd": Curve("", "standard deviation of bias_p"),
+        "controller/thermometer_error": Curve("degC", "estimated difference: true minus measured temperature"),
+        "controller/dose_spread": Curve("", "estimated relative standard deviation of a dose, at least dose_cv"),
+        "controller/dose_gain": Curve("", "estimated ratio of delivered to requested dose"),
+        "controller/composition_od": Curve("OD", "density estimated by the composition's estimator"),
+        "controller/pigment": Curve("counts", "estimated fluorescence of the pigment"),
+        "result/share_abs_error": Curve("", "mean |share - setpoint| over all times with a setpoint"),
     },
     columns={
         "fluorescence": "share/fluorescence",

@@ -1,4 +1,4 @@
-"""Laws of the composition: from estimated and wanted share to a thermostat target."""
+"""Composition controllers: from estimated share and its setpoint to a thermostat target."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -22,11 +22,11 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class LawConfig:
-    """What every composition controller has."""
+    """Settings of every composition controller."""
 
     kind: str = setting("proportional", "composition controller")
-    control_min: float = setting(1.0, "between decisions; the target is kept in between", "min", within=(1, 240))
-    estimator: CompositionEstimatorConfig = part(CompositionEstimatorConfig, "what the filter believes")
+    control_min: float = setting(1.0, "time between decisions, with a constant target", "min", within=(1, 240))
+    estimator: CompositionEstimatorConfig = part(CompositionEstimatorConfig, "settings of the estimator")
 
     def __post_init__(self) -> None:
         check(self, "composition")
@@ -36,9 +36,9 @@ Config = TypeVar("Config", bound=LawConfig)
 
 
 class Periodic(ABC, Generic[Config]):
-    """A law that decides at whole multiples of its period since the program began, and keeps its target in between.
+    """Base class of controllers that decide at multiples of a period since the program began, with constant targets.
 
-    Args: pair: the two species. What stands here as colder is warmer where warmth makes the second species gain.
+    Args: pair: the two species. "Colder" in the settings means warmer if the second species gains by warmth.
     """
 
     remembers: tuple[str, ...] = ("target", "next")
@@ -50,40 +50,40 @@ class Periodic(ABC, Generic[Config]):
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
+        """Reset the state for n cultures."""
         self._target, self._next = np.full(n, self._even_c), np.zeros(n)
 
     def act(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
-        """Return thermostat targets, degC, (N,); called once per control period of the density.
+        """Return thermostat targets, degC, (N,). The loop calls this once per control period of the density.
 
-        Args: minute: since the program began, (N,). rows: True where the estimate is new and a setpoint is in force;
-          only these rows' state advances.
+        Args: minute: since the program began, (N,). rows: True where the estimate is new and the share has a setpoint;
+          only the state of these rows changes.
         """
         idx = np.flatnonzero(rows & (minute >= self._next - 1e-6))
         if idx.size:
             now = estimate.of(idx)
             asked = Wanted(*(a[idx] for a in (wanted.setpoint, wanted.following, wanted.minutes)))
-            shown = self._decide(now, asked, minute[idx], idx) - now.thermometer  # what the thermostat goes by
+            shown = self._decide(now, asked, minute[idx], idx) - now.thermometer  # as the thermometer shows it
             self._target[idx] = np.clip(shown, *self.pair.temperatures)
             self._next[idx] = (np.floor(minute[idx] / self.control_min + 1e-6) + 1.0) * self.control_min
         return self._target.copy()
 
     @abstractmethod
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        """Decide true temperatures for the rows `idx`, whose estimates and wishes are given, degC; the caller clips."""
+        """Return true temperatures for the rows `idx`, degC. All arguments have only these rows; the caller clips."""
 
 
 @dataclass(frozen=True)
 class ProportionalConfig(LawConfig):
-    """One gain, on the difference of logits."""
+    """Settings of the proportional controller."""
 
-    gain: float = setting(20.0, "colder per logit that the share is too small", "degC", within=(0.1, 1000))
+    gain: float = setting(20.0, "degrees colder per logit by which the share is too small", "degC", within=(0.1, 1000))
 
 
 class Proportional(Periodic[ProportionalConfig]):
-    """T = T_0 - gain (logit s - logit r): at equal rates, T_0, on the setpoint s, colder where the share is too small.
+    """Controller T = T_0 - gain (logit s - logit r), with share r and setpoint s.
 
-    T_0 is where the estimated growth curves cross: 33.2 degC, were they without error.
+    T_0 is the temperature at which the estimated growth curves cross: 33.2 degC if the curves have no error.
     """
 
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
@@ -93,17 +93,17 @@ class Proportional(Periodic[ProportionalConfig]):
 
 @dataclass(frozen=True)
 class PIConfig(LawConfig):
-    """The vendor's gains."""
+    """Settings of the PI controller; the defaults are the vendor's gains."""
 
     kind: str = setting("pi", "composition controller")
-    gain: float = setting(15.0, "colder per unit of the share that it is too small", "degC", within=(0, 1000))
-    integral: float = setting(0.01, "per unit of the share and decision", "degC", within=(0, 10))
+    gain: float = setting(15.0, "degrees colder per unit by which the share is too small", "degC", within=(0, 1000))
+    integral: float = setting(0.01, "integral gain per decision, for the same error", "degC", within=(0, 10))
 
 
 class PI(Periodic[PIConfig]):
-    """T = 33.2 - 15 (s - r) - I, I <- I + 0.01 (s - r) each minute; I rests while T is at the limit it pushes against.
+    """The vendor's PI: T = 33.2 - 15 (s - r) - I, I <- I + 0.01 (s - r) each minute, frozen while it pushes at a limit.
 
-    T is the measured temperature: the vendor's law knows of no error of the thermometer.
+    T is the measured temperature: the vendor's controller ignores the estimated error of the thermometer.
     Source: program `CustomCompControl` of Janmorlock/ChiBio, the device's code for Lee et al. (2025).
     """
 
@@ -128,13 +128,13 @@ class PI(Periodic[PIConfig]):
 
 @dataclass(frozen=True)
 class BangBangConfig(LawConfig):
-    """All or nothing."""
+    """Settings of the bang-bang controller."""
 
     kind: str = setting("bang_bang", "composition controller")
 
 
 class BangBang(Periodic[BangBangConfig]):
-    """T = 29 while the share is too small, else 36."""
+    """Controller T = 29 degC while the share is too small, else 36 degC, for *E. coli* and *P. putida*."""
 
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         return np.where(logit(wanted.setpoint) > estimate.logit, self.pair.raising, self.pair.lowering)
@@ -142,16 +142,16 @@ class BangBang(Periodic[BangBangConfig]):
 
 @dataclass(frozen=True)
 class InverseDynamicsConfig(LawConfig):
-    """How soon the setpoint is to be reached."""
+    """Settings of inverse dynamics."""
 
     kind: str = setting("inverse_dynamics", "composition controller")
-    reach_min: float = setting(30.0, "time constant with which the error is to vanish", "min", within=(1, 1440))
+    reach_min: float = setting(30.0, "time constant with which the error decays", "min", within=(1, 1440))
 
 
 class InverseDynamics(Periodic[InverseDynamicsConfig]):
-    """Law of inverse dynamics: the error vanishes like exp(-t / reach).
+    """Inverse dynamics: the error of the logit decays like exp(-t / reach).
 
-    It takes the temperature at which the first species, which answers at once, grows by
+    The controller chooses T so that the first species, which follows the temperature at once, grows at the rate
     (1 + b_e) mu_e(T) = m_p - (logit s - logit r) / reach
     """
 
@@ -163,14 +163,14 @@ class InverseDynamics(Periodic[InverseDynamicsConfig]):
 
 @dataclass(frozen=True)
 class MyopicConfig(LawConfig):
-    """One look ahead by the model."""
+    """Settings of the one-step controller."""
 
     kind: str = setting("myopic", "composition controller")
-    control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
+    control_min: float = setting(10.0, "time between decisions, with a constant target", "min", within=(1, 240))
 
 
 class Myopic(Periodic[MyopicConfig]):
-    """The one of 17 temperatures after which, by the model, the share is nearest to the setpoint."""
+    """One-step controller: of 17 temperatures it chooses the one whose predicted share is nearest to the setpoint."""
 
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         state, errors = estimate.state, estimate.errors
@@ -179,24 +179,25 @@ class Myopic(Periodic[MyopicConfig]):
 
 @dataclass(frozen=True)
 class MidpointConfig(InverseDynamicsConfig):
-    """When to begin, and what holds until then."""
+    """Settings of `midpoint`; reach_min applies while it acts as `inverse_dynamics`."""
 
     kind: str = setting("midpoint", "composition controller")
-    control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
+    control_min: float = setting(5.0, "time between decisions, with a constant target", "min", within=(1, 240))
 
 
 class Midpoint(InverseDynamics):
-    """Half-way, in logit, when an announced change comes: full authority from so early that the model is there then.
+    """Controller that is half-way to the next setpoint, in logit, at the time of an announced change.
 
-    The error is convex in the share, so being early by as much as late costs least. Before that, and where nothing is
-    announced, as `InverseDynamics`. Once begun it goes on until the change comes.
+    It applies the hottest or coldest temperature from the time at which the model predicts this, until the change.
+    Otherwise it acts as `InverseDynamics`. The cost is convex in the error, so the smallest total cost has equal errors
+    before and after the change.
     """
 
     remembers = ("target", "next", "towards")
 
     def reset(self, n: int) -> None:
         super().reset(n)
-        self._towards = np.full(n, np.nan)  # setpoint that the share is on its way to before it is asked for
+        self._towards = np.full(n, np.nan)  # next setpoint, once the controller moves towards it
 
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now, following = logit(wanted.setpoint), logit(wanted.following)
@@ -210,7 +211,7 @@ class Midpoint(InverseDynamics):
         return np.where(moving, full, super()._decide(estimate, wanted, minute, idx))
 
     def _reached(self, estimate: ShareEstimate, target: Array, minutes: Array) -> Array:
-        """Logit after `minutes`, (N,), at targets (N,), by the estimated curves; to the nearest period."""
+        """Predict the logit after `minutes` at constant targets, (N,), with the estimated curves, in whole periods."""
         state, steps = estimate.state, np.rint(minutes / self.control_min)
         reached = state[:, 0].copy()
         for k in range(int(steps.max(initial=0.0))):
@@ -221,37 +222,35 @@ class Midpoint(InverseDynamics):
 
 @dataclass(frozen=True)
 class LearnedLawConfig(LawConfig):
-    """The policy that sees no change before it comes."""
+    """Settings of a learned controller that does not observe announced changes."""
 
     kind: str = setting("dqn", "composition controller")
-    control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
+    control_min: float = setting(10.0, "time between decisions, with a constant target", "min", within=(1, 240))
 
 
 @dataclass(frozen=True)
 class PreviewLawConfig(LearnedLawConfig):
-    """The policy to which changes are announced."""
+    """Settings of a learned controller that observes announced changes."""
 
     kind: str = setting("dqn_preview", "composition controller")
-    control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
+    control_min: float = setting(5.0, "time between decisions, with a constant target", "min", within=(1, 240))
 
 
 def _unnamed(pair: PairConfig) -> PairConfig:
-    """Return a pair whose species are called by numbers."""
+    """Return a copy of a pair whose species are named 1 and 2, to compare pairs without their names."""
     return replace(pair, first=replace(pair.first, name="1"), second=replace(pair.second, name="2"))
 
 
 class LearnedLaw(Periodic[LearnedLawConfig]):
-    """Law of a learned policy, T = actions[argmax_a Q(o, a)].
+    """Learned controller T = actions[argmax_a Q(o, a)].
 
-    The observation is o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
-    setpoint, minutes until then].
-
-    Shown in place of m_p is m_p - (b_e - b) mu_e(33.2): an error b_e of the other curve, beyond the b that it was
-    trained with, moves the share as much as that of m_p does. A change further ahead than the policy was trained for is
-    not shown to it yet. It may decide more often than in training, as a receding horizon does: an action is worth what
-    it is worth for a whole period, and is thought over before.
-    Args: policy: with one of these observations, which all cultures follow.
-    Raises: ValueError for a policy of another task.
+    The observation is o = [logit r, T, m_p, logit s], and with preview [..., logit of the next setpoint, minutes until
+    then]. The value given for m_p is m_p - (b_e - b) mu_e(33.2), with the estimated error b_e of the first species'
+    curve and the error b of the training: this difference changes the share as much as an equal change of m_p.
+    A change that is further ahead than in training is not yet given to the policy. The controller may decide more
+    often than in training: it then replaces an action before the period for which Q values it has ended.
+    Args: policy: policy with one of these observations, used for all cultures.
+    Raises: ValueError for a policy of another task or pair.
     """
 
     def __init__(self, config: LearnedLawConfig, policy: Policy, pair: PairConfig | None = None) -> None:
@@ -263,13 +262,13 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     def _check(self, policy: Policy) -> None:
         preview = self.config.kind == "dqn_preview"
         task, expected = ("coculture_preview", SEEN_AHEAD) if preview else ("coculture", SEEN)
-        remedy = f"one with observation {list(expected)}, as env={task} trains"
+        remedy = f"a policy with observation {list(expected)}, trained with env={task}"
         require(policy.observation == expected, "policy", list(policy.observation), remedy)
         known = build(PairConfig(), policy.metadata["model"].get("pair", {}), "pair")
         here, there = (f"{p.first.name} and {p.second.name}" for p in (self.pair, known))
         off = np.abs(known.rates(grid := np.linspace(*self.pair.temperatures, 71)) - self.pair.rates(grid)).max()
         said = f"of {there}, for a run with {here}; growth differs by up to {off:.2g} 1/h"
-        allowed = "the run's own: train one with pair=... of the run, or give a law without a policy"
+        allowed = "that of the run: train a policy with pair=... of the run, or use a controller without a policy"
         require(_unnamed(known) == _unnamed(self.pair), "policy's pair", said, allowed)
 
     def _decide(self, estimate: ShareEstimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
@@ -285,29 +284,29 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
 
 @lru_cache(maxsize=64)
 def _ahead(model: CocultureConfig, setpoints: tuple[float, ...]) -> Array:
-    """Least cost of decisions with these setpoints in force, on the grid, (G,)."""
+    """Return the smallest cost of a sequence of decisions with these setpoints, on the grid, (G,)."""
     return np.asarray(cost_to_go(transitions(model), np.array(setpoints)[:, None])[0, :, 0])
 
 
 def _best(model: CocultureConfig, value: Array | None, estimate: ShareEstimate, setpoint: Array) -> Array:
-    """Choose the best temperature now, by the estimated curves; what comes after it by the model's."""
+    """Return the best temperatures: next step with the estimated curves, later costs `value` with the model's."""
     chosen = best_action(model, transitions(model), value, estimate.state, setpoint, estimate.errors)
     return np.asarray(model.targets()[chosen])
 
 
 @dataclass(frozen=True)
 class RecedingConfig(LawConfig):
-    """How far it plans."""
+    """Settings of the receding-horizon controller."""
 
     kind: str = setting("receding", "composition controller")
-    control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
-    horizon_min: float = setting(360.0, "how far ahead it plans", "min", within=(1, 1440))
+    control_min: float = setting(30.0, "time between decisions, with a constant target", "min", within=(1, 240))
+    horizon_min: float = setting(360.0, "length of the plan", "min", within=(1, 1440))
 
 
 class Receding(Periodic[RecedingConfig]):
-    """The first action of the best plan for the next hours: least sum of (r - s)^2 after each decision, on the model.
+    """Receding horizon: it applies the first action of the plan with the smallest predicted sum of (r - s)^2.
 
-    The setpoint is that in force until the announced change, then the next one. Programs are planned once and kept.
+    The plan assumes the current setpoint until an announced change, then the next one. Plans are cached by setpoints.
     """
 
     def __init__(self, config: RecedingConfig, pair: PairConfig | None = None) -> None:
@@ -328,17 +327,17 @@ class Receding(Periodic[RecedingConfig]):
 
 @dataclass(frozen=True)
 class OptimumConfig(LawConfig):
-    """How often it decides."""
+    """Settings of `optimum`."""
 
     kind: str = setting("optimum", "composition controller")
-    control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
+    control_min: float = setting(30.0, "time between decisions, with a constant target", "min", within=(1, 240))
 
 
 class Optimum(Periodic[OptimumConfig]):
-    """Dynamic programming over the whole program, known from its beginning; what is announced does not matter to it.
+    """Dynamic programming over the whole program, which the controller knows from the start, announced or not.
 
-    Where no share is asked for, the next one counts already. After the end the last decision's value holds.
-    Args: program: what will be asked for.
+    In phases without a setpoint it plans with the next one. After the end it decides as in the last period.
+    Args: program: setpoints of the share.
     """
 
     def __init__(self, config: OptimumConfig, program: Program, pair: PairConfig | None = None) -> None:

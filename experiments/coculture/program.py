@@ -1,4 +1,4 @@
-"""The share that is asked for over time, and how much of it is known ahead."""
+"""Setpoints of the share over time, and their announcement to the controller."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,23 +11,23 @@ from conf.schema import require, setting
 from envs.scenario import Phased, Scenario
 from experiments.coculture.base import Array, Wanted
 
-ANNOUNCED_MIN = 360.0  # how long ahead a change of a share is known where nothing else is asked for
+ANNOUNCED_MIN = 360.0  # default time by which a change of the share's setpoint is announced before it happens
 
 SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4
-"""A share that changes all the time is announced as a step to the one so far ahead, after that part of this time
+"""A sine is announced as a step: to its share SINE_LEAD_MIN ahead, in SINE_STEP times SINE_LEAD_MIN minutes
 (docs/coculture.md, Composition controllers).
 """
 
 
 class Ratios:
-    """What a scenario may ask for beside its density: a share, phase by phase or as a sine, t since the recovery ended.
+    """Settings of a scenario for the share of the second species: one setpoint per phase, or a sine.
 
-    Where it does, whoever controls the composition decides on the temperature; elsewhere the schedule's holds.
+    While the share has a setpoint, the composition controller decides the temperature; otherwise the schedule does.
     """
 
     ratios: tuple[float | None, ...] = setting(
         (),
-        "setpoint of the share of B in each phase, null for none; empty: in no phase",
+        "setpoint of the share of B in each phase, null: none; empty: none in any phase",
         above=0.0,
         below=1.0,
     )
@@ -39,13 +39,13 @@ class Ratios:
         scenario = cast(Scenario, self)
         object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
         if composed(scenario):
-            why = "[] where a share is asked for, whose controller plans by the minutes"
+            why = "[] with setpoints of a share, because composition controllers need fixed times"
             require(not any(scenario.until), "scenario.until", scenario.until, why)
             if scenario.announce_min in (None, "auto"):
                 object.__setattr__(self, "announce_min", ANNOUNCED_MIN)
         scenario.one_each("ratios")
         if self.ratio_sine:
-            require(not self.ratios, "scenario.ratios", self.ratios, "[] beside ratio_sine")
+            require(not self.ratios, "scenario.ratios", self.ratios, "[] with ratio_sine")
             given = tuple(self.ratio_sine)
             words = "mean, amplitude and period in min > 0, with |amplitude| < mean and |amplitude| < 1 - mean"
             require(len(given) == 3 and given[2] > 0.0, "scenario.ratio_sine", given, words)
@@ -58,13 +58,13 @@ def ratios_of(scenario: Scenario) -> Ratios:
 
 
 def composed(scenario: Scenario) -> bool:
-    """Whether a share is asked for at any time."""
+    """Return whether a scenario has a setpoint of the share at any time."""
     asked = ratios_of(scenario)
     return bool(asked.ratio_sine) or any(r is not None for r in asked.ratios)
 
 
 def resting(scenario: Scenario, even_c: float) -> Scenario:
-    """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""
+    """Return a scenario with a temperature in every phase, by default `even_c`, degC, where both species grow alike."""
     return replace(scenario, temperatures=tuple(even_c if t is None else t for t in scenario.temperatures))
 
 
@@ -79,10 +79,10 @@ def program_of(scenario: Scenario) -> "Program":
 
 @dataclass(frozen=True)
 class Program(Phased):
-    """Shares of the second species, one of each phase (nan: none is asked for), or a sine.
+    """Setpoints of the share of the second species over time: one per phase, or a sine.
 
-    sine: mean, amplitude and period in min of s(t) = mean - amplitude sin(2 pi t / period), t from the program's
-    beginning. minutes: length of each phase.
+    ratios: setpoint of each phase, nan for none. minutes: length of each phase. sine: mean, amplitude and period (min)
+    of s(t) = mean - amplitude sin(2 pi t / period), with t in min since the program began.
     """
 
     ratios: tuple[float, ...] = ()
@@ -93,7 +93,7 @@ class Program(Phased):
         return np.minimum(np.searchsorted(self.edges[1:], minute + 1e-9, side="right"), len(self.minutes) - 1)
 
     def setpoint(self, minute: Array) -> Array:
-        """Share asked for at each minute, nan where none is and before the start; the last one after the end."""
+        """Return the setpoint at each minute: nan without one and before the start; after the end the last one."""
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)
         if self.sine is None:
             wanted = np.asarray(self.ratios)[self._phase(np.maximum(at, 0.0))]
@@ -103,10 +103,10 @@ class Program(Phased):
         return np.where(at < 0.0, np.nan, wanted)
 
     def wanted(self, minute: Array, preview_min: float = 0.0) -> Wanted:
-        """Return what a law is told at each minute since the program began, (N,).
+        """Return the setpoints that a controller receives at each minute since the program began, (N,).
 
-        Args: preview_min: how long before it a change is announced; 0: never. Only a change from one share to another
-          is one. A sine is announced as a step: in 120 min to its share in 300, or both shorter by `preview_min` < 300.
+        Args: preview_min: time by which a change from one share to another is announced; 0: never. A sine is announced
+          as a step to its share 300 min ahead, in 120 min; for `preview_min` < 300 both times are shorter.
         """
         now = self.setpoint(minute)
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)
@@ -123,14 +123,14 @@ class Program(Phased):
 
     @property
     def extremes(self) -> tuple[float, ...]:
-        """Every share of the phases, or the least and the largest of the sine."""
+        """All setpoints of the phases, or the smallest and largest setpoint of the sine."""
         if self.sine is not None:
             mean, amplitude, _ = self.sine
             return mean - abs(amplitude), mean + abs(amplitude)
         return tuple(r for r in self.ratios if not math.isnan(r))
 
     def announcements(self, preview_min: float) -> tuple[Array, Array]:
-        """When a change is made known, min since the program began, and the share to come; none of a sine."""
+        """Return the minutes at which changes are announced, and the new setpoints; both empty for a sine."""
         if self.sine is not None or preview_min <= 0.0:
             return np.empty(0), np.empty(0)
         when, which = self._changes()
@@ -139,7 +139,7 @@ class Program(Phased):
         return np.maximum(when - preview_min, self.edges[:-1])[first], which[first]
 
     def _changes(self) -> tuple[Array, Array]:
-        """Of each phase: when another share is asked for next, inf where never, and which."""
+        """Return for each phase the minute of the next change to another setpoint (inf: never), and that setpoint."""
         when, which = np.full(len(self.minutes), np.inf), np.array(self.ratios, dtype=np.float64)
         for k in range(len(which) - 2, -1, -1):
             now, after = self.ratios[k], self.ratios[k + 1]

@@ -1,4 +1,4 @@
-"""An estimator that takes late samples: it goes back in time and replays all data since."""
+"""Estimator that uses late samples: it goes back to the time of the sample and replays all later data."""
 
 import copy
 from collections.abc import Callable, Iterable
@@ -10,15 +10,15 @@ import numpy as np
 from experiments.coculture.base import Array, Mask, ShareEstimate
 from experiments.coculture.estimator import CompositionEstimator
 
-KEPT_MIN, EVERY_MIN = 2880.0, 60.0  # a plate is counted a day after it was spread; from each copy on all is replayed
-AT_ONCE = 480  # readings and doses that are taken again with each new reading: some .2 s
+KEPT_MIN, EVERY_MIN = 2880.0, 60.0  # age of the oldest copy (plates are counted after a day); time between two copies
+AT_ONCE = 480  # calls that are replayed with each new reading; this takes about 0.2 s
 
 Shown = tuple[float, str, tuple[Any, ...]]
 
 
 @dataclass
 class Chapter:
-    """Copy of the estimator at a minute, and the calls it has had since: (minute, method, arguments)."""
+    """Copy `then` of the estimator at `minute`, and the calls that followed. shown: (minute, method, arguments)."""
 
     minute: float
     then: CompositionEstimator
@@ -27,7 +27,7 @@ class Chapter:
 
 @dataclass
 class Again:
-    """Estimator copy that replays past data; the next item is entry `entry` of chapter `chapter`."""
+    """Copy of the estimator that replays past data. Its next call is number `entry` of chapter `chapter`."""
 
     chapter: int
     estimator: CompositionEstimator
@@ -35,18 +35,18 @@ class Again:
 
 
 class Recall:
-    """An estimator, and its last two days.
+    """Estimator with a record of its last two days, for samples that are counted late.
 
-    A share that was counted belongs to the minute at which the sample was drawn, which may be a day ago. Then a copy of
-    the estimator goes back to the full hour before that, and takes again all readings, doses and samples in their
-    order, as many with each new reading as the loop can wait for; once it has caught up it stands in for the estimator.
-    The result equals a filter that had the sample at once. A resumed run replays its last two days (`retell`).
+    A counted share belongs to the minute at which the sample was drawn, which may be a day ago. A copy of the estimator
+    from up to an hour before that minute then replays all readings, doses and samples in order, a limited number with
+    each new reading. Once it has caught up, it replaces the estimator. The result is the same as if the sample had been
+    known at once. A resumed run replays its last two days (`retell`).
     """
 
     remembers = ("estimator", "earliest")
 
     def __init__(self, estimator: CompositionEstimator) -> None:
-        self.estimator, self.earliest = estimator, copy.deepcopy(estimator)  # the latter: of the first chapter
+        self.estimator, self.earliest = estimator, copy.deepcopy(estimator)  # earliest: copy of the first chapter
         self._chapters: list[Chapter] = []
         self._again: Again | None = None
 
@@ -67,7 +67,7 @@ class Recall:
 
     @property
     def known(self) -> Array:
-        """Up to which minute `retell` needs nothing of each culture; -inf where it needs all, (N,)."""
+        """Minute up to which `retell` needs no data of each culture; -inf: it needs all data, (N,)."""
         return self.earliest.since
 
     @property
@@ -84,7 +84,7 @@ class Recall:
         self._catch_up()
 
     def _begin(self, now: float) -> None:
-        """Begin a new chapter; forget what is older than two days, except what is just being replayed."""
+        """Begin a new chapter; drop chapters older than two days, unless they are being replayed."""
         self._chapters.append(Chapter(now, copy.deepcopy(self.estimator)))
         while now - self._chapters[0].minute > KEPT_MIN and (self._again is None or self._again.chapter > 0):
             self._chapters.pop(0)
@@ -99,25 +99,26 @@ class Recall:
             self.estimator.dosed(volume_ml)
 
     def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
-        """Shares that were counted in samples drawn at a minute, with their sds, (N,); False: longer ago than is known.
+        """Use shares counted in samples that were drawn at `minute`; return False if that is too long ago.
 
-        It is taken behind the readings of that minute. See `behind`.
+        A sample counts as drawn after the readings of its minute. While `behind`, the estimate does not yet include it.
+        Args: share, sd: counted shares and their sds, (N,). rows: cultures with a sample.
         """
         if self._chapters and not self.earliest.begun.any():
-            minute = max(minute, self._chapters[0].minute)  # of the inoculum: as if drawn with the first reading
+            minute = max(minute, self._chapters[0].minute)  # a sample of the inoculum counts at the first reading
         at = next((k for k in reversed(range(len(self._chapters))) if self._chapters[k].minute <= minute), None)
         if at is None:
             return False
         shown = self._chapters[at].shown
         place = next((k for k, (when, _, _) in enumerate(shown) if when > minute), len(shown))
         shown.insert(place, (minute, "sample", (np.array(share), np.array(sd), np.array(rows))))
-        if self._again is None or at <= self._again.chapter:  # else it is met on the way
+        if self._again is None or at <= self._again.chapter:  # else the running replay includes it
             self._again = Again(at, copy.deepcopy(self._chapters[at].then))
         self._catch_up()
         return True
 
     def retell(self, shown: Iterable[Shown]) -> None:
-        """Replay what a resumed run was shown before the resume, in order, after what is `known`.
+        """Replay the calls that a resumed run received before the resume and after `known`, in order.
 
         Until the replay is complete, the estimate is the saved one.
         """
@@ -130,7 +131,7 @@ class Recall:
                 self._chapters.append(Chapter(minute, copy.deepcopy(self.earliest)))
             self._chapters[-1].shown.append((minute, method, arguments))
         if self._chapters:
-            same = self.estimator.since >= last - 1e-3  # of these it is known what the device dosed since then, too
+            same = self.estimator.since >= last - 1e-3  # the saved estimator knows the doses since the last reading
             self._chapters[-1].shown.append((self._last(), "gave", (self.estimator.given_ml.copy(), same)))
             self._again = Again(0, copy.deepcopy(self.earliest))
 
@@ -144,7 +145,7 @@ class Recall:
         act(*arguments)
 
     def _catch_up(self) -> None:
-        """Replay some more of the past; once all of it is replayed, the copy becomes the estimator."""
+        """Replay the next calls; after the last one, the copy becomes the estimator."""
         again = self._again
         for _ in range(AT_ONCE):
             if again is None:

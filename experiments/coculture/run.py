@@ -1,4 +1,4 @@
-"""What two species do to a run that is put together: its pair, its vials, its composition controller."""
+"""Guest of two species in a run: it adds the pair, the vials, the composition controller and its signal."""
 
 import logging
 from dataclasses import asdict, replace
@@ -35,18 +35,18 @@ COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # pr
 
 
 class TwoSpecies(Guest):
-    """The share of the second species is held by the thermostat where a scenario asks for it."""
+    """Guest that adds composition control by the thermostat if a scenario has setpoints of the share."""
 
     def completed(self, config: DeployConfig, folder: Path | None) -> DeployConfig:
-        """Fill in the composition controller and the vials where a scenario asks for a composition.
+        """Fill in the composition controller and the vials if a scenario has a composition.
 
-        All simulated vials get the two species of the run.
+        Simulated vials get the two species of the run.
         """
         config = config if folder is None else _with_pair(config, folder)
         pair = read_pair(of_deploy(config).pair)
         if any(map(composed, config.schedules())):
             config = _composed(config, pair)
-        usual = of_plant(config.plant).pair == PairConfig()  # another one differs on purpose
+        usual = of_plant(config.plant).pair == PairConfig()  # the user may have chosen another pair for the plant
         if family_of(config.backend).simulated and usual:
             config = replace(config, plant=of_pair(config.plant, pair))
         return config
@@ -54,10 +54,10 @@ class TwoSpecies(Guest):
     def signals(
         self, config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]
     ) -> list[Signal]:
-        """Build the share's signal, or that of light which nobody uses."""
+        """Build the signal of the share, or, without a composition controller, a signal that only records light."""
         family, backend = family_of(config.backend), config.backend
         if any(map(composed, scenarios)) and not family.can.fluorescence:
-            why = "measures no fluorescence, by which a share is known; drop them or use a Chi.Bio"
+            why = "measures no fluorescence, which the share's estimate needs; remove the ratios or use a Chi.Bio"
             raise frame.UserError(f"scenario.ratios: backend={backend.kind} {why}")
         if of_deploy(config).composition is not None:
             return [_share(config, plant, folder, scenarios)]
@@ -75,7 +75,7 @@ class TwoSpecies(Guest):
     def asked(self, scenario: Scenario, phase: int) -> str:
         ratios = ratios_of(scenario).ratios
         share = ratios[phase] if ratios else None
-        return "" if share is None else f"share {share:g}, which decides the temperature"
+        return "" if share is None else f"share {share:g}, whose controller decides the temperature"
 
 
 def _changed(config: DeployConfig, **values: Any) -> DeployConfig:
@@ -83,7 +83,7 @@ def _changed(config: DeployConfig, **values: Any) -> DeployConfig:
 
 
 def _with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
-    """Keep a copy of two species from a file, `pair.yaml`, by which the run goes, also when it is resumed."""
+    """Copy a pair that is read from a file into the run folder, and let the config name this copy, also on resume."""
     asked = of_deploy(config).pair
     kept, given = folder / FILE, read_pair(asked) if config.resume is None else None
     if given is not None and asked not in presets.groups()["strains"]:
@@ -107,14 +107,14 @@ def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
         chosen.append(f"plant={VIALS}")
     config = replace(config, safety=_within(config.safety, pair))
     if chosen:
-        log.info("the scenario asks for a share: %s", " ".join(chosen))
+        log.info("set because the scenario has a composition: %s", " ".join(chosen))
     species, (low, high) = f"{pair.first.name} and {pair.second.name}", pair.temperatures
     log.info("%s, %g to %g degC; both grow alike at %.2f degC", species, low, high, pair.even_c)
     return config
 
 
 def _rested(config: DeployConfig, pair: PairConfig) -> DeployConfig:
-    """Every phase without a temperature gets that at which both grow alike."""
+    """Give every phase without a temperature the temperature of equal growth."""
     each = {
         name: own | {"temperatures": [pair.resting_c if t is None else t for t in own["temperatures"]]}
         if isinstance(own, dict) and isinstance(own.get("temperatures"), list)
@@ -125,7 +125,7 @@ def _rested(config: DeployConfig, pair: PairConfig) -> DeployConfig:
 
 
 def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
-    """Limits of the thermostat's target: those of the pair where nothing else is asked for. Raises: UserError."""
+    """Set the limits of the thermostat's target to those of the pair, unless they are configured. Raises: UserError."""
     usual, given = SafetyConfig(), (safety.composition_low, safety.composition_high)
     low, high = (
         end if asked == left else asked
@@ -135,7 +135,7 @@ def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
     )
     if not low < pair.even_c < high:
         allowed = (
-            f"a range that holds {pair.even_c:.2f} degC, where {pair.first.name} and {pair.second.name} grow alike"
+            f"a range that includes {pair.even_c:.2f} degC, where {pair.first.name} and {pair.second.name} grow alike"
         )
         raise frame.UserError(
             f"safety.composition_low to composition_high = {low:g} to {high:g} degC: allowed {allowed}"
@@ -144,22 +144,24 @@ def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
 
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
-    """Build the signal of the share. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
-    from experiments.coculture.policies import check_shares, composition_policy  # and certificates with them
+    """Build the signal of the share. Raises: UserError, ValueError if scenario, backend and controller do not fit."""
+    from experiments.coculture.policies import check_shares, composition_policy  # slow: also imports certificates
 
     asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if composed(s)]
     family, two = family_of(config.backend), of_deploy(config)
     kind = two.composition.kind
     if not asked:
-        remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
-        raise frame.UserError(f"composition={kind}: no scenario asks for a share; {remedy}")
+        remedy = "add scenario=ratio_steps or scenario.ratios, or remove composition"
+        raise frame.UserError(f"composition={kind}: no scenario has setpoints of the share; {remedy}")
     vials = family.vials(config.backend, plant)
     if vials is not None and not of_plant(vials[1]).second.present:
         key = f"{vials[0]}={VIALS}"
-        raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
+        raise frame.UserError(f"composition={kind}: the vials contain only one species; use {key}")
     one = next(s for s in scenarios if composed(s))
     if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
-        raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
+        raise frame.UserError(
+            "composition=optimum: the reactors' programs differ; give all the same shares and minutes"
+        )
     policy = composition_policy(kind, two.composition_policy, folder, config.resume is not None)
     program, volumes_ml = program_of(one), config.bench.volumes(config.backend.reactors)
     pair = read_pair(two.pair)

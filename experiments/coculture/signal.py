@@ -1,4 +1,4 @@
-"""The share of two species as a signal: held by the thermostat, within limits, with lasting warnings."""
+"""The share of the second species as a signal that the thermostat controls, with warnings."""
 
 import bisect
 import math
@@ -22,30 +22,30 @@ from experiments.loop.signals import Answer, Count, Findings, Sample, Span
 from hardware.actuator import THERMOSTAT
 from hardware.memory import Remembers
 
-ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
+ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # values of `explain` that are columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"
-EDGE_C = 0.05  # a target so near a limit is at it
-NEARER = 0.1  # of the logit: a share that has moved so far towards its goal comes nearer; 0.025 at one half
-OTHER = 0.02  # a goal that jumps by more is another one
-SURPRISING = 4.0  # sds
-STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
+EDGE_C = 0.05  # degC; a target nearer than this to a limit counts as at the limit
+NEARER = 0.1  # change of the logit that counts as coming nearer to the goal; 0.025 of the share at one half
+OTHER = 0.02  # a goal that changes by more counts as a new goal
+SURPRISING = 4.0  # a count further off than this many sds gives a warning
+STUCK = "check that the vial follows the thermostat and that both species grow; the setpoint may change too fast"
 UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
 
 
 @dataclass(frozen=True)
 class ShareWarnings:
-    """When a share is said to be out of control. Raises: ValueError naming key, value and allowed range."""
+    """Limits of the warnings about a composition. Raises: ValueError with key, value and allowed range."""
 
-    far: float = setting(0.1, "a share farther than this from its setpoint is far", within=(0.01, 1))
+    far: float = setting(0.1, "share_stuck: smallest distance of the share from its setpoint", within=(0.01, 1))
     stuck_h: float = setting(
         3.0,
-        "a share is stuck that is far and came no nearer for so long with the thermostat's target at a limit",
+        "share_stuck: time without getting nearer while the thermostat's target is at a limit",
         "h",
         above=0.0,
     )
-    wide: float = setting(0.4, "an estimate whose 95 % band is wider than this is uncertain", within=(0.01, 1))
-    wide_h: float = setting(2.0, "if it is so for this long", "h", at_least=0.0)
+    wide: float = setting(0.4, "share_uncertain: smallest width of the estimate's 95 % band", within=(0.01, 1))
+    wide_h: float = setting(2.0, "share_uncertain: time with such a band", "h", at_least=0.0)
 
     def __post_init__(self) -> None:
         check(self, "share_warnings")
@@ -55,10 +55,10 @@ class LightSignal:
     """Fluorescence of reactors without a composition controller: recorded only."""
 
     name, actuator, columns, memory = "fluorescence", "", COLUMNS[:1], None
-    sees_light = False  # what is measured anyhow
+    sees_light = False  # it records fluorescence only if the device measures it anyway
 
     def decide(self, sample: Sample) -> Array:
-        """See `Signal.decide`: it asks for no temperature."""
+        """Return nan, (N,): this signal commands no actuator."""
         return np.full(sample.rows.shape, np.nan)
 
     def find(self, sample: Sample, given: Array) -> Findings:
@@ -66,7 +66,7 @@ class LightSignal:
         return Findings({"fluorescence": np.full(sample.rows.shape, np.nan) if light is None else light})
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
-        """See `Signal.dosed`."""
+        """Do nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +79,15 @@ class Decider:
 
 
 class Share:
-    """The share of the second species in N reactors, each with its own program; held by the thermostat.
+    """Signal of the second species' share in N reactors, each with its own program, controlled by the thermostat.
 
-    Targets are cut by the interlock. There is no limit of their rate: the device's thermostat takes any step, and the
-    interlock allows for a vial that still cools (docs/biology.md, Vial temperature).
-    A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
-    uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
+    The interlock limits the targets. Their rate of change is not limited: the device's thermostat accepts any step, and
+    the interlock tolerates a vial that is still cooling (docs/biology.md, Vial temperature).
+    Each sample has a warning while the share is stuck or its estimate uncertain, as defined by `ShareWarnings`. A new
+    setpoint or announcement restarts the time of `stuck_h`.
 
-    Args: estimator: what is believed; law: what is done about it; schedules: one per reactor; warnings: when to warn.
-      simulated: the recording has the true share, which `truth` gives. species: whose share it is, in figures.
+    Args: estimator, law: estimator and controller. schedules: one per reactor. warnings: limits of the warnings.
+      simulated: whether the recording has a column with the true share. species: name of the second species.
     """
 
     name, actuator, sees_light = "composition", THERMOSTAT.name, True
@@ -107,21 +107,21 @@ class Share:
         self.species = species
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)
         n = len(schedules)
-        self._goal, self._best = np.full((2, n), np.nan), np.full((2, n), np.nan)  # the nearest share to it so far
+        self._goal, self._best = np.full((2, n), np.nan), np.full((2, n), np.nan)  # best: nearest share so far
         self._nearer_min, self._narrow_min = np.full((2, n), np.nan), np.full(n, np.nan)
         estimator.reset(n)
         law.reset(n)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """See `Signal`; a simulation's true share is the last."""
+        """Columns of the recording; in a simulation the last column is the true share."""
         return (*COLUMNS, TRUE) if self.simulated else COLUMNS
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
         self.truth = lambda: plant.culture.share
 
     def decide(self, sample: Sample) -> Array:
-        """See `Signal.decide`; nan where no share is asked for."""
+        """Return thermostat targets, degC, (N,); nan where the share has no setpoint."""
         m, wanted = sample.measured, self.wanted(sample.elapsed)
         asked = np.isfinite(wanted.setpoint)
         self.estimator.watch(m.od, sample.light, m.temperature, sample.minute, sample.believed)
@@ -143,7 +143,7 @@ class Share:
         return Findings(found, why, self._warned(found, goal, inside, sample.minute, sample.believed))
 
     def wanted(self, elapsed: Array) -> Wanted:
-        """Return what each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
+        """Return the setpoints of each reactor's program, `elapsed` min after its start; none where that is nan."""
         found = np.empty((3, elapsed.size))
         for schedule in set(self.schedules):
             rows = np.array([other == schedule for other in self.schedules])
@@ -154,9 +154,9 @@ class Share:
     def _warned(
         self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask
     ) -> list[str | None]:
-        """Warn of what is out of control in each used row, None elsewhere.
+        """Return a warning or None for each reactor.
 
-        Args: goal: the share that is announced, else the one asked for, (N,). inside: targets that are at no limit.
+        Args: goal: announced setpoint, else the current one, (N,). inside: whether the target is not at a limit, (N,).
         """
         stuck = self._stuck(found["ratio"], np.stack([found["ratio_setpoint"], goal]), inside, minute, believed)
         uncertain = self._uncertain(found, minute, believed)
@@ -165,9 +165,9 @@ class Share:
         for i in range(minute.size):
             said = []
             if stuck[i]:
-                at = f"share {c['ratio'][i]:.2f}, wanted {goal[i]:.2f}"
+                at = f"share {c['ratio'][i]:.2f}, setpoint {goal[i]:.2f}"
                 heat = f"the thermostat at {c['temperature_target_degc'][i]:.1f} degC"
-                said.append(f"share_stuck: {at}, no nearer for {hours[i]:.1f} h with {heat}; reported; {STUCK}")
+                said.append(f"share_stuck: {at}, not nearer for {hours[i]:.1f} h with {heat}; reported; {STUCK}")
             if uncertain[i]:
                 between = f"share between {c['ratio_low'][i]:.2f} and {c['ratio_high'][i]:.2f}"
                 said.append(f"share_uncertain: {between}; reported; {UNCERTAIN}")
@@ -175,7 +175,7 @@ class Share:
         return lines
 
     def _stuck(self, share: Array, goal: Array, inside: Mask, minute: Array, believed: Mask) -> Mask:
-        """Which come nearer to neither of two goals, (2, N), the share asked for and the one announced."""
+        """Return which shares are stuck, (N,): nearing neither goal, (2, N): current setpoint and announced one."""
         rows, away = believed & np.isfinite(goal), goal - share
         same = np.abs(goal - self._goal) <= OTHER
         well = rows & (inside | ~(np.abs(away) > self.warnings.far) | ~same)
@@ -196,14 +196,14 @@ class Share:
         told = self.estimator.explain()
         before, band = told["ratio"][n], told["ratio_high"][n] - told["ratio_low"][n]
         if not self.estimator.sample(np.where(mine, share, np.nan), np.full(mine.size, sd), minute, mine):
-            return "left out: longer ago than the two days that the estimate goes back", True
+            return "ignored: drawn more than two days ago, before the data that the estimator keeps", True
         off = abs(share - before) / math.hypot(sd, band / 3.92)
-        doubt = f"; {off:.0f} sds from it, if the share has not moved since: right reactor, right species?"
-        after = "its day is taken again, some hours with each reading"
+        doubt = f"; the count is {off:.0f} standard deviations off: check reactor and species, unless the share changed"
+        after = "the estimate since then is being recomputed"
         if not self.estimator.behind:
-            after = f"{self.estimator.explain()['ratio'][n]:.3f} after it"
+            after = f"{self.estimator.explain()['ratio'][n]:.3f} with the count"
         surprising = off > SURPRISING
-        return f"estimated {before:.3f} before it; {after}{doubt if surprising else ''}", surprising
+        return f"estimate {before:.3f} without the count; {after}{doubt if surprising else ''}", surprising
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
         known, told = self.estimator.known + 1e-3, []  # minutes are recorded to 1e-4
@@ -229,7 +229,7 @@ class Share:
         return self
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
-        """See `Signal.dosed`; deferred volumes (`kept_ml`) are counted when they are delivered."""
+        """Report the delivered volume to the estimator; it counts deferred volumes when they are delivered."""
         self.estimator.dosed(volume_ml)
 
     def draw(self, table: Any, title: str) -> dict[str, Any]:

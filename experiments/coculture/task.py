@@ -1,4 +1,4 @@
-"""The composition of two species for a training run: state and program in, a temperature out."""
+"""Training task of two species: an agent controls their composition by the temperature."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -33,36 +33,36 @@ from experiments.coculture.base import SEEN, SEEN_AHEAD
 from experiments.training.evaluation import Rollout, each, rollout
 
 Array = NDArray[np.float64]
-SPAN = 3.0  # |logit of the share| that is trained: 0.05 to 0.95
+SPAN = 3.0  # largest |logit of the share| in training: shares 0.05 to 0.95
 FINE = Grid(logits=321)
 
 
 class Coculture:
-    """See `Task`; arguments and errors of every method are described there."""
+    """Training task of two species. `Task` describes the attributes, and arguments and errors of every method."""
 
     unit = "of the share"
     arrived = 0.02
     provable = False
     scalars: Mapping[str, float] = {}
     steady_unit = 0.02
-    """Twice what an estimate is good for: the regret decides, unless a share rests clearly beside its setpoint."""
+    """Limit of the steady error: twice the error of an estimate, so that mostly the regret decides."""
 
     def __init__(self, config: CocultureConfig) -> None:
         self.config = config
-        self.regret_unit = 5.0 if config.preview_min else 0.5  # where planning pays there is more to lose
+        self.regret_unit = 5.0 if config.preview_min else 0.5  # %; higher with preview, where planning has a benefit
         self.steps = self.episode_steps = config.episode_steps
-        ahead, law = "no change known ahead", "dqn"
+        ahead, law = "no announced changes", "dqn"
         if config.preview_min:
-            ahead, law = f"the next setpoint known {config.preview_min:g} min ahead", "dqn_preview"
+            ahead, law = f"setpoints announced {config.preview_min:g} min ahead", "dqn_preview"
         every = f"a decision every {config.control_min:g} min"
-        self.description = f"shares of two species by temperature, {every}, {ahead}"
+        self.description = f"composition of two species by temperature, {every}, {ahead}"
         self.tried = f"plant=coculture scenario=ratio_steps composition={law} composition_policy={{}}"
         self.steady_steps = max(1, config.episode_steps // 6)
         self.observation: tuple[str, ...] = SEEN_AHEAD if config.preview_min else SEEN
         self.actions = config.targets()
         self.limits = limits(config)
         for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.span, strict=True):
-            end[LOGIT], end[TEMPERATURE] = span, temperature  # beyond what is trained a policy sees the end of it
+            end[LOGIT], end[TEMPERATURE] = span, temperature  # a policy's inputs are cut to this range
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> CocultureVectorEnv:
         env = CocultureVectorEnv(len(seeds), self.config)
@@ -70,7 +70,7 @@ class Coculture:
         return env
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Another place of the share, other setpoints, another time of the change."""
+        """Build the relabelling of transitions with another share, other setpoints and another time of the change."""
         low, high = self.config.setpoints
         return ProgramRelabel(
             agent,
@@ -83,17 +83,17 @@ class Coculture:
         )
 
     def selection_grid(self) -> Array:
-        """Between the reported points: 8 starts .06 to .94 x 8 setpoints, or changes between each two of these."""
+        """Return starts between the reported ones: 8 shares x 8 setpoints; with preview, changes between setpoints."""
         return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.06, 0.94, 8))
 
     def report_grid(self) -> Array:
-        """Pair starts .05 to .95 with setpoints .1 to .9; with preview, add a change between each two setpoints."""
+        """Return the reported starts: 19 shares x 9 setpoints; with preview, changes between each two setpoints."""
         return self._grid(np.linspace(0.1, 0.9, 9), np.linspace(0.05, 0.95, 19))
 
     def _grid(self, setpoints: Array, starts: Array) -> Array:
-        """Cultures at rest: at the first of two setpoints with the change as far ahead as it is announced, or anywhere.
+        """Return observations of cultures at rest: each start with each setpoint.
 
-        The episode begins when the change is announced.
+        With preview: at each setpoint, at the moment when the change to each other setpoint is announced.
         """
         c = self.config
         if not c.preview_min:
@@ -105,7 +105,7 @@ class Coculture:
         return np.concatenate([at_rest(c, now), np.stack([now, following, time], axis=1)], axis=1)
 
     def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
-        """Advance the model and the program by one decision; r - setpoint."""
+        """Advance the model and the program by one decision; return the observation and the error r - setpoint."""
         c = self.config
         state = advance(c, observation[..., :3], self.actions[action], c.control_min)
         error = share(state[..., LOGIT]) - share(observation[..., SETPOINT])
@@ -119,7 +119,7 @@ class Coculture:
         programs, which = np.unique(start[:, 3:].round(9), axis=0, return_inverse=True)
         shape = (self.steps, 1, len(start))
         run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
-        for first in range(0, len(programs), 24):  # so many at a time bound the memory
+        for first in range(0, len(programs), 24):  # in groups of 24, to limit the memory
             rows = np.flatnonzero((which >= first) & (which < first + 24))
             own, state, goal = which[rows] - first, start[rows, :3], programs[first : first + 24]
             setpoints = np.empty((self.steps, len(goal)))
@@ -135,7 +135,7 @@ class Coculture:
         return run
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
-        """Choose the temperature after which the share is nearest to the setpoint in force."""
+        """Return the action after which the share is nearest to the current setpoint."""
         flat = observation.reshape(-1, observation.shape[-1])
         action = best_action(self.config, None, None, flat[:, :3], share(flat[:, SETPOINT]))
         return action.reshape(observation.shape[:-1])
@@ -144,7 +144,7 @@ class Coculture:
         return {"control_min": self.config.control_min, "model": asdict(self.config)}
 
     def figures(self, policy: Policy) -> dict[str, Figure]:
-        """Share, setpoint and temperature of a few episodes beside the optimum's."""
+        """Draw share, setpoint and temperature of six episodes, with those of the optimum."""
         grid = self.selection_grid()
         picked = grid[np.linspace(0, len(grid) - 1, 6).astype(int)]
         ours, theirs = rollout(each(policy), self, picked[None]), self.best(picked)

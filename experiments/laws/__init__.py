@@ -1,1 +1,1 @@
-"""What decides: what a law is asked (`base`), and every law of every signal by its name (`registry`)."""
+"""Controllers: their interface (`base`), and the registry of all controllers of all signals (`registry`)."""

@@ -1,4 +1,4 @@
-"""Interface of a controller: N pump rates for N reactors, once per sample. A structural type without inheritance."""
+"""Interface of controllers: N pump rates for N reactors, once per sample. Controllers need not inherit from it."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -14,7 +14,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """Common config of every controller."""
+    """Base class of the configs of controllers. kind: name of the controller."""
 
     kind: str = setting("", "controller")
 
@@ -23,43 +23,43 @@ class ControllerConfig:
 
 
 class Controller(Protocol):
-    """Controller of one pump rate per reactor and sample.
+    """Controller that decides one pump rate per reactor and sample.
 
     The same controller serves one reactor on the bench and 64 replicates in simulation. Reactors are independent:
-    row i of a batch gives the same result as that reactor alone. A controller with a memory declares it in `remembers`,
-    for a resumed run (`hardware/memory.py`).
+    row i of a batch gives the same result as that reactor alone. A controller with a state lists the attributes that a
+    resumed run restores in `remembers` (`hardware/memory.py`).
     """
 
     def reset(self, n: int) -> None:
-        """Forget everything; start a run with n reactors."""
+        """Reset the state for a new run with n reactors."""
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """Return the pump rates for the next control period, mL/s, shape (N,).
 
         Args:
-          od: newest reading, shape (N,); nan without a valid one.
+          od: newest reading, shape (N,); nan without a valid reading.
           setpoint: OD to hold, shape (N,), > 0.
           minute: when the reading was taken, min since the run began, shape (N,).
-          rows: True for a new and valid reading, shape (N,). Only these rows' internal state advances; other returned
-          values are ignored.
-        Raises: nothing for readings of any value.
+          rows: True for a new and valid reading, shape (N,). Only the state of these rows may change; the returned
+          values of other rows are ignored.
+        It must not raise, whatever the readings.
         """
 
 
 @runtime_checkable
 class Explains(Protocol):
-    """A controller that can explain its last decision."""
+    """Controller that can explain its last decision."""
 
     def explain(self) -> dict[str, Array]:
-        """Return name -> value of the last decision, each with leading axis N."""
+        """Return the values behind the last decision, name -> array with leading axis N."""
 
 
 @runtime_checkable
 class Accounts(Protocol):
-    """A controller that uses the volume delivered, which may differ from its decision."""
+    """Controller that uses the volume delivered, which may differ from its decision."""
 
     def dosed(self, volume_ml: Array) -> None:
-        """Take the volume delivered, or carried over to the next dose, since the last call, mL, shape (N,)."""
+        """Process the volume that was delivered since the last call or deferred to the next dose, mL, shape (N,)."""
 
 
 class Speeds(Protocol):
@@ -75,7 +75,7 @@ class Speeds(Protocol):
 
 @runtime_checkable
 class Estimates(Protocol):
-    """A controller that estimates growth and pump."""
+    """Controller with an estimator of growth and pump."""
 
     @property
     def estimator(self) -> Speeds: ...
@@ -83,12 +83,12 @@ class Estimates(Protocol):
 
 @runtime_checkable
 class Watches(Protocol):
-    """A controller that uses every valid reading, also before the schedule begins, and temperatures."""
+    """Controller that uses temperatures, and every valid reading, also before the schedule begins."""
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Watch a sample before each `act`; arguments as there, also in recovery; temperature: degC, nan if unknown."""
+        """Process a sample: before each `act`, with the same arguments, and in recovery. temperature: degC, or nan."""
 
 
 def usable(od: Array, rows: Mask) -> Mask:
-    """Rows with a new reading that is a number."""
+    """Return the rows with a new reading that is a number."""
     return np.asarray(rows & np.isfinite(od))

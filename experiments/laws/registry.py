@@ -1,4 +1,4 @@
-"""Every controller of every signal: its config, what makes it, and what it is made from."""
+"""Registry of the controllers of all signals: their configs, and how each is built."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ DENSITY = "density"
 
 @dataclass(frozen=True)
 class LawKind:
-    """A controller: the class of its config, the function that makes it, and the parts that this function gets."""
+    """Registered controller. config: class of its config. make: function that builds it. parts: arguments of `make`."""
 
     config: type[Any]
     make: Callable[..., Any]
@@ -35,7 +35,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a controller: its value where none is given, and the error where it cannot be None."""
+    """Object that controllers can need. usual: its default. missing: error text if it is None; "": None is allowed."""
 
     usual: Any = None
     missing: str = ""
@@ -43,10 +43,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Laws:
-    """What the laws of a signal have in common.
+    """Controllers of a signal.
 
-    key: where a law is said in a config, and group of its presets; "": below `signals`, without any. parts: by name.
-    kinds: the laws, by name.
+    key: config key of the controller and group of its presets; "": the key is signals.NAME, without presets.
+    parts: name -> object that a controller can need. kinds: name -> controller.
     """
 
     key: str = ""
@@ -58,12 +58,12 @@ SIGNALS = {
     DENSITY: Laws(
         "controller",
         {
-            "model": Part(),  # growth, control period and largest pump rate, as calibrated
+            "model": Part(),  # growth model, control period and largest pump rate
             "policy": Part(missing="needs a policy; give policy=RUN/policy.npz"),
-            "plant": Part(missing="knows a simulated plant; allowed with backend=sim only"),
-            "bounds": Part(),  # within which the policy's certificate lets it act; None: nobody supervises
-            "flow_ml_s": Part(1.0),  # what the backend believes its pumps deliver, by which the oracle doses
-            "volume_ml": Part(Bench.volume_ml),  # of the cultures, (N,) or one for all
+            "plant": Part(missing="needs the exact state of a simulated plant; use it only with backend=sim"),
+            "bounds": Part(),  # bounds on estimation errors from the policy's certificate; None: not supervised
+            "flow_ml_s": Part(1.0),  # pump flow that the backend assumes; the oracle computes doses from it
+            "volume_ml": Part(Bench.volume_ml),  # volume of the cultures, (N,) or one for all
         },
         {
             "dqn": LawKind(LearnedConfig, learned, ("policy", "model", "bounds")),
@@ -83,7 +83,7 @@ KINDS = SIGNALS[DENSITY].kinds
 
 
 def hold(signal: str, key: str, parts: Mapping[str, Part]) -> None:
-    """Register a signal whose controllers have their own config key and presets. Args: as of `Laws`."""
+    """Register a signal whose controllers have their own config key and presets. Args as in `Laws`."""
     SIGNALS[signal] = Laws(key, parts)
 
 
@@ -93,13 +93,13 @@ def add(
     """Register a controller: `controller=KIND` for density, `signals.NAME.kind=KIND` for another signal.
 
     Args:
-      kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      make: called with the config and then the `parts`, returns the controller.
-      what: the help text; "": that of the preset in conf/.
-      parts: other objects that `make` needs, from those of the signal.
-      signal: what the controller holds: density, or a signal of `experiments.loop.signals.add`.
-    Raises: ValueError for a kind that exists, or a part that the signal lacks.
+      kind: name of the controller; also the default of the field `kind` of `config`.
+      config: dataclass of its settings; define the fields with `conf.schema.setting`.
+      make: function that receives the config and the `parts`, and returns the controller.
+      what: the help text; "": use the help text of the preset in conf/.
+      parts: names of other objects that `make` needs; the signal must have them.
+      signal: the quantity to control: density, or a signal registered by `experiments.loop.signals.add`.
+    Raises: ValueError if the kind exists or the signal lacks a part.
     """
     held = SIGNALS.setdefault(signal, Laws())
     if wrong := set(parts) - set(held.parts):
@@ -114,19 +114,19 @@ def add(
 def _kind(kind: str, signal: str) -> LawKind:
     held = SIGNALS.get(signal, Laws())
     if kind not in held.kinds:
-        missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(SIGNALS)}"
+        missing = f"none, because there is no such signal; define it in extend=FILE.py, or use {', '.join(SIGNALS)}"
         key = f"{held.key or f'signals.{signal}'}.kind"
         raise NotAllowed(key=key, given=kind, allowed=", ".join(held.kinds) or missing)
     return held.kinds[kind]
 
 
 def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
-    """Tell whether a controller is made from this part, e.g. "policy". Raises: ValueError naming the controllers."""
+    """Return whether a controller needs a part, e.g. "policy". Raises: ValueError with the known controllers."""
     return part in _kind(kind, signal).parts
 
 
 def on_device(kind: str) -> str:
-    """Return the density controller, if it needs no simulated plant. Raises: ValueError naming those that do not."""
+    """Return `kind` if this density controller can run on a device (without a plant). Raises: ValueError otherwise."""
     known = [name for name, law in KINDS.items() if "plant" not in law.parts]
     if kind not in known:
         raise NotAllowed(key="controller_kind", given=kind, allowed=", ".join(known))
@@ -134,14 +134,14 @@ def on_device(kind: str) -> str:
 
 
 def config(kind: str, signal: str = DENSITY) -> Any:
-    """Return the default config of a controller. Raises: ValueError naming the controllers."""
+    """Return the default config of a controller. Raises: ValueError with the known controllers."""
     return _kind(kind, signal).config()
 
 
 def config_at(kind: str, key: str) -> Any:
-    """Return the default config of a law by where it stands: controller, controllers.NAME, signals.NAME.
+    """Return the default config of a controller for a config key: controller, controllers.NAME or signals.NAME.
 
-    Raises: ValueError naming the laws there are.
+    Raises: ValueError with the known controllers.
     """
     group, _, name = key.partition(".")
     keys = {held.key + s: signal for signal, held in SIGNALS.items() for s in ("", "s") if held.key}
@@ -149,10 +149,10 @@ def config_at(kind: str, key: str) -> Any:
 
 
 def build(config: Any, signal: str = DENSITY, **given: Any) -> Any:
-    """Build the law that a config describes: of the density a `Controller`.
+    """Build the controller that a config describes; a density controller is a `Controller`.
 
-    Args: config: as `config` gives it; `kind` names the law. given: parts of the signal, by name.
-    Raises: ValueError naming what is missing for this law.
+    Args: config: config of a registered controller. given: name -> part of the signal.
+    Raises: ValueError naming a part that the controller needs and that is missing.
     """
     law, held, made = _kind(config.kind, signal), SIGNALS[signal], {}
     for name in law.parts:

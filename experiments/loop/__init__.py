@@ -1,1 +1,1 @@
-"""The closed loop: sample, schedule, law, interlock, dose; and how well it held."""
+"""The closed loop (sample, schedule, controller, interlock, dose), and metrics of how well it held the setpoint."""

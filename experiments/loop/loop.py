@@ -1,6 +1,6 @@
-"""The closed loop, the same for simulation, emulator and device: measure, decide, check, actuate.
+"""The closed loop for simulation, emulator and device: measure, decide, check, actuate.
 
-It is a generator of what happened. Clocks and wires belong to the reactors, files and screens to the caller.
+It yields a record of each step. The reactors own clocks and connections; the caller owns files and screen.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,25 +25,24 @@ from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import RAW_MAX, Response
 from hardware.safety.interlock import Interlock, Ruling
 
-OURS = (THERMOSTAT, *SPARE.values())  # the others reach the reactors by their names
+OURS = (THERMOSTAT, *SPARE.values())  # actuators with own fields in a Command; others are in it by name
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Step:
-    """One pass through the loop; arrays (N,).
+    """Record of one pass through the loop; arrays (N,).
 
-    rows: reactors with a new sample, for which the rest is to be read. now_s: run time, s.
-    minute: when the OD was measured, min since the run began. elapsed: since the schedule began, nan in recovery.
-    phase: of the schedule, -1 in recovery. proposed, rate: before and after the interlock, mL/s.
-    volume_ml: asked of the pump, and what the device repeated since the row before; known only after the dose was
-    begun. reasons: of the interlock, for all reactors.
-    response: of the interlock. notes: of the reactors. explanation: of the laws. done: schedule over.
-    columns: further ones of the recording, of the signals beside the density.
-    raw, blank: counts behind the OD and those of clear medium; nan where the reactors have none.
-    pump: number of the pump that gives the dose, 1 (the feed), 3 or 4. believed: rows whose OD the interlock takes for
-      the culture's.
-    position: of each reactor, where it stands in its schedule (`ClosedLoop.position`). ended: steps of the schedule
-      that this sample ended by their condition.
+    rows: reactors with a new sample; the other attributes are valid only for these. now_s: run time, s.
+    minute: time of the OD measurement, min since the run began. elapsed: min since the schedule began, nan in recovery.
+    phase: step of the schedule, -1 in recovery. proposed, rate: pump rate before and after the interlock, mL/s.
+    volume_ml: volume requested from the pump, plus volumes that the device repeated since the last row; nan until the
+    dose has begun. reasons: alarms of the interlock and warnings of signals, one text or None per reactor.
+    response: the interlock's response. notes: texts of the reactors. explanation: values that explain the decision.
+    done: whether the schedule is over. columns: further columns of the recording, from signals.
+    raw, blank: sensor counts of the OD reading and of clear medium; nan where unknown.
+    pump: pump of the dose: 1 (feed), 3 or 4. believed: rows whose OD the interlock accepts as valid.
+    position: each reactor's position in its schedule, as `ClosedLoop.position` returns it. ended: rows whose sample
+      met the condition that ends a step.
     """
 
     now_s: float
@@ -72,23 +71,23 @@ class Step:
 
 
 class ClosedLoop:
-    """Signals x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
+    """Closed loop of N reactors with signals, interlock and schedules. Reactors may be sampled at different times.
 
-    Each reactor first recovers (grows to `recovery_od`, or beyond and is diluted to it), then runs its schedule on its
-    own time. A reading that the interlock does not believe begins no schedule and is not shown to the controller.
+    Each reactor first recovers: it grows to `recovery_od`, or beyond and is diluted to it. Then its schedule begins.
+    A reading that the interlock rejects starts no schedule and is not shown to the controller.
 
     Args:
-      reactors: N reactors. controller: decides on the feed. interlock: of N reactors.
+      reactors, interlock: for N reactors. controller: decides the feed pump's rate.
       schedules: one per reactor, or one for all.
-      at_end: of each reactor, or one for all, once its schedule is over and others are not: "hold" goes on at the last
-        setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
-      before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
-      scale: of each culture over that of the law's model, as of `Density`.
-      further: signals beside the density; each commands its actuator, in place of the schedules wherever it decides.
-      actuators: what the reactors have.
-      model: growth model with which an estimator begins beside a controller that has none, where changes are announced.
-    Raises: ValueError for another number of schedules than of reactors, two signals with one actuator, or one whose
-      actuator the reactors do not have.
+      at_end: what a reactor does when its schedule is over and others are not; one per reactor, or one for all: "hold"
+        (keep the last setpoint), "stop" (no more doses) or "regulate" (hand over to the device's own regulation).
+      before_dose: function that receives each decided step before any dose; it writes the journal.
+      scale: volume of each culture divided by that of the controller's model, as in `Density`.
+      further: signals beside the density. The command of a signal replaces that of the schedule.
+      actuators: all actuators of the reactors.
+      model: growth model of an estimator that is added if changes are announced and the controller has no estimator.
+    Raises: ValueError if the numbers of schedules and reactors differ, if two signals use the same actuator, or if a
+      signal needs an actuator that the reactors do not have.
     """
 
     remembers = ("began", "done", "stopped")
@@ -124,19 +123,19 @@ class ClosedLoop:
         self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s, asked)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
-        self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
-        self.repeated_ml = np.zeros(n)  # by the devices themselves, in no step yet
-        self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
+        self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, with pumps verified off
+        self.repeated_ml = np.zeros(n)  # volumes that devices repeated and no step contains yet
+        self.gone = np.zeros(n, dtype=np.bool_)  # given up and absent, so its pumps cannot be verified off
         controller.reset(n)
 
     def known(self, plant: Plant, flow_ml_s: float) -> None:
-        """Tell the signals of simulated vials. Args: flow_ml_s: of a pump as the driver takes it."""
+        """Give the signals access to the simulated vials. Args: flow_ml_s: pump flow that the driver assumes, mL/s."""
         for signal in self.signals:
             if isinstance(signal, Knows):
                 signal.known(plant, flow_ml_s, self.interlock.bench)
 
     def run(self) -> Iterator[Step]:
-        """Yield each step until every reactor's schedule is over or the reactor was given up. Raises: ReactorError."""
+        """Yield steps until every reactor's schedule is over or the reactor was given up. Raises: ReactorError."""
         while not self.over:
             yield self.step()
 
@@ -146,7 +145,7 @@ class ClosedLoop:
         return bool((self.done | self.stopped | self.gone).all())
 
     def step(self) -> Step:
-        """Wait for a sample of at least one reactor (or for trouble), and act on it."""
+        """Wait for a sample of at least one reactor, decide, dose, and return the step. Raises: ReactorError."""
         m = self.reactors.measure()
         now = self.reactors.elapsed()
         self._book_repeats()
@@ -170,7 +169,7 @@ class ClosedLoop:
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
         proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.bench.period_s)
         verdict = self.interlock.check(m, proposed, self.density.aim, temperature, now)
-        sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
+        sound = rows & (verdict.response == Response.PASS)  # the device's regulation uses the same sensor
         left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
         columns, explanation, reasons = self._findings(sample, commands, verdict)
@@ -215,7 +214,7 @@ class ClosedLoop:
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
 
     def _commands(self, sample: Sample) -> dict[str, Array]:
-        """Ask each signal beside the density; return the commands by actuator, as cut by the interlock."""
+        """Let the signals beside the density decide; return actuator -> command within the interlock's limits."""
         commands: dict[str, Array] = {}
         for signal, actuator in self._commanded:
             asked = shaped(signal.decide(sample), len(self.done), f"signal {signal.name}: what decide returns")
@@ -230,7 +229,7 @@ class ClosedLoop:
     def _findings(
         self, sample: Sample, commands: Mapping[str, Array], verdict: Ruling
     ) -> tuple[dict[str, Array], dict[str, Array], Sequence[str | None]]:
-        """Collect what the signals tell of a sample: columns, why, and their warnings with the interlock's reasons."""
+        """Collect the signals' findings on a sample: columns, explanations, and warnings joined to the alarms."""
         columns: dict[str, Array] = {AIM: self.density.aim} if self.progress.announced else {}
         why: dict[str, Array] = {}
         reasons: Sequence[str | None] = verdict.reasons
@@ -244,7 +243,7 @@ class ClosedLoop:
         return columns, why, reasons
 
     def _book_repeats(self) -> None:
-        """Book what the devices dosed by themselves at its own time, before the sample after it is judged."""
+        """Book doses that the devices repeated by themselves, at their own times, before the sample is judged."""
         for at_s, receipt in self.reactors.repeated():
             pump = np.full(len(self.done), receipt.pump or FEED.pump)
             self.book(receipt, at_s, pump)
@@ -252,14 +251,14 @@ class ClosedLoop:
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
     def book(self, receipt: Receipt, at_s: float, pump: NDArray[np.intp]) -> None:
-        """Book a dose with the interlock and every signal. Args: at_s: run time, s. pump: which gave it, (N,)."""
+        """Report a dose to the interlock and every signal. Args: at_s: run time, s. pump: number of the pump, (N,)."""
         self.interlock.confirm(receipt, at_s)
         kept_ml = np.zeros(len(self.done)) if receipt.kept_ml is None else receipt.kept_ml
         for signal in self.signals:
             signal.dosed(receipt.volume_ml, kept_ml, pump)
 
     def set_level(self, name: str, level_ml: float) -> float:
-        """Set the ledger of a vial, and the device's own, to a level that was read; return the old level, mL."""
+        """Set a vial's level, mL, in the ledger of interlock and device to a measured value; return the old level."""
         n, ledger = self.reactors.names.index(name), self.interlock.budget.volume_ml
         before, ledger[n] = float(ledger[n]), level_ml
         if isinstance(self.reactors, KeepsLevels):
@@ -267,26 +266,26 @@ class ClosedLoop:
         return before
 
     def refilled(self, name: str, bottle_ml: float) -> None:
-        """Go on with a bottle that was filled to so much."""
+        """Set the volume, mL, of a reactor's bottle after a refill."""
         self.interlock.refilled(self.reactors.names.index(name), bottle_ml)
 
     def counted(self, name: str, value: float, sd: float, minute: float) -> Answer:
-        """Take what was counted in a sample of a reactor, drawn at a minute of the run; return what came of it."""
+        """Pass a counted sample to the signal that uses it; return the outcome. Args: minute: when it was drawn."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 return signal.counted(self.reactors.names.index(name), value, sd, minute)
-        return "left out: nothing here estimates it", True
+        return "ignored: no estimator uses this measurement", True
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count]) -> None:
-        """Replay recordings from before a resume, and counted samples, to every estimator that uses them."""
+        """Replay earlier recordings and counted samples to every signal that uses them, after a resume."""
         for signal in self.signals:
             if isinstance(signal, Counted):
                 signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))
 
     def _respond(self, verdict: Ruling, left: Mask) -> list[str]:
-        """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.
+        """Carry out the interlock's responses, such as pumps off or heat off; return the failures, which are retried.
 
-        Args: left: reactors that are to be left to their own regulation from now on, shape (N,).
+        Args: left: reactors to hand over to the device's own regulation now, (N,).
         """
         failed: list[str] = []
         off = verdict.response == Response.PUMPS_OFF
@@ -305,18 +304,18 @@ class ClosedLoop:
         return failed
 
     def position(self, n: int) -> dict[str, Any]:
-        """Return what a decision for reactor n keeps of the position in its schedule; plain numbers."""
+        """Return reactor n's position in its schedule, as plain numbers for the journal."""
         return {"began": float(self.began[n]), **memory.row(self.progress, n), **memory.row(self.supply, n)}
 
     def state(self) -> dict[str, Any]:
-        """Where each reactor's schedule, the interlock and the signals stand; plain numbers and lists."""
+        """Return the state of schedules, interlock and signals, as plain numbers and lists to save."""
         state = memory.save(self) | {"interlock": self.interlock.state()}
         state |= {key: found for key, part in self._rows.items() if (found := memory.rows(part))}
         kept = {signal.name: signal.memory for signal in self.signals}
         return state | {name: memory.save(one) for name, one in kept.items() if one is not None}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
+        """Restore a saved state; None stands for nan. Raises: ValueError for a part that is missing or does not fit."""
         memory.restore(self, state, "loop")
         for key, part in self._rows.items():
             memory.restore_rows(part, state.get(key, "missing"), key)

@@ -1,12 +1,12 @@
-"""How well a setpoint was held, per window of a recording; every metric takes a leading axis of N reactors.
+"""Metrics of how well a setpoint was held, per window of a recording, for N reactors at once.
 
-Both conventions of the paper's 1/T are given, because its text leaves T open:
+The paper's metrics contain 1/T, but it does not state T. Both conventions are computed:
 
     ise  = (1 / 1 min) int e(t)^2 dt       ise_mean  = (1 / window) int e(t)^2 dt
     itae = (1 / 1 min) int t |e(t)| dt     itae_mean = (1 / window) int t |e(t)| dt
 
 with e = x - setpoint, t in min from the start of the window, integrals by the trapezoidal rule over the samples. The
-first convention (T = 1 min, the control period) is the only one under which the published table is consistent.
+published table is consistent only with the first convention (T = 1 min, the control period).
 """
 
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SETTLING_BAND = 0.05  # relative: settled from the first moment after which |e| <= 5 % of the setpoint for good
-LATE_MIN = 120.0  # min at the end of a window over which a late error is averaged
-STEADY_MIN = 10.0  # min at the end of a window over which the steady error is averaged
+SETTLING_BAND = 0.05  # largest |e| of a settled culture, as a fraction of the setpoint
+LATE_MIN = 120.0  # last minutes of a window over which the late error is averaged
+STEADY_MIN = 10.0  # last minutes of a window over which the steady error is averaged
 
 
 @dataclass(frozen=True, eq=False)
 class WindowMetrics:
-    """One window of N reactors; each array (N,), nan where there are fewer than two samples.
+    """Metrics of N reactors in a window; arrays (N,), nan where there are fewer than two samples.
 
-    settling_min: nan where the band is not reached for good within the window.
-    steady_abs_error: mean |e| over the last 10 min. abs_error: over the window.
+    settling_min: minutes until |e| stays inside the band to the end; nan if it does not.
+    steady_abs_error: mean |e| over the last 10 min. abs_error: mean |e| over the window.
     """
 
     setpoint: float
@@ -40,7 +40,7 @@ class WindowMetrics:
 
 
 def _carry_forward(values: Array, valid: NDArray[np.bool_]) -> Array:
-    """Replace what is not valid by the last valid value before it (the first valid one at the start)."""
+    """Replace invalid values by the last valid value before them, or at the start by the first valid value."""
     index = np.where(valid, np.arange(values.shape[1]), -1)
     index = np.maximum.accumulate(index, axis=1)
     first = np.argmax(valid, axis=1)[:, None]
@@ -48,14 +48,14 @@ def _carry_forward(values: Array, valid: NDArray[np.bool_]) -> Array:
 
 
 def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end: float) -> WindowMetrics:
-    """Metrics of the samples with start <= minute <= end.
+    """Compute the metrics of the samples with start <= minute <= end.
 
-    A sample at the very end belongs to this window with this window's setpoint, and to the next with the next one's.
+    A sample at the border of two windows belongs to both, each time with that window's setpoint.
 
     Args:
-      minute: sample times, min, shape (N, K), rising along K; nan where there is no sample.
-      od: shape (N, K); nan readings are skipped, the integral spans the gap.
-      setpoint: of the window. start, end: of the window, min.
+      minute: sample times, min, (N, K), rising along K; nan where there is no sample.
+      od: (N, K); a nan reading is skipped, and the integral spans the gap.
+      setpoint, start, end: setpoint and limits, min, of the window.
     """
     tolerance = 1e-6
     if not minute.size:
@@ -92,9 +92,9 @@ def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end:
 
 
 def mean_errors(minute: Array, value: Array, setpoint: Array, start: float, end: float) -> tuple[Array, Array]:
-    """Mean |value - setpoint| over the samples with start <= minute < end, and over the last two hours of them.
+    """Return the mean |value - setpoint| over the samples with start <= minute < end, and over their last two hours.
 
-    Each (N,), nan where there is none. Args: minute, value, setpoint: (N, K), nan where there is none.
+    Both have shape (N,), nan without samples. Args: minute, value, setpoint: (N, K), nan where missing.
     """
     error = np.abs(value - setpoint)
     inside = np.isfinite(error) & (minute >= start - 1e-6) & (minute < end - 1e-6)

@@ -1,7 +1,7 @@
-"""What the loop holds: signals. Each has an estimate, a law that decides, an actuator, columns and warnings of its own.
+"""Signals: the quantities that the loop controls, each with estimate, controller, actuator, columns and warnings.
 
-The density, held by the feed pump, is always one of them (`Density`). Another is brought by a guest, or made known by
-`add` (docs/extending.md).
+The density, controlled by the feed pump, is always one of them (`Density`). A guest or an extension can add others
+(`add`, docs/extending.md).
 """
 
 import math
@@ -26,22 +26,21 @@ from hardware.safety.interlock import Interlock
 
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
-AIM = "aim"  # column of a recording: the setpoint that the controller is given, which an announced change moves ahead
+AIM = "aim"  # column of a recording: setpoint given to the controller; an announced change alters it in advance
 PARTS = ("actuator", "columns", "sees_light", "decide", "find", "dosed", "memory")
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "journal_row")
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What every signal is shown of a sample; arrays (N,).
+    """Sample as every signal receives it; arrays (N,).
 
-    measured: by the reactors. light: counts of its fluorescence that are believed, nan for all others.
-    rows: reactors with a new sample; believed: those whose OD is taken for the culture's.
-    minute: when it was taken, min since the run began. elapsed: min since the schedule began, nan before.
-    phase: of the schedule, -1 before. setpoint: OD asked for. temperature: the schedule's target, degC.
-    following, left_min: the setpoint after it and the minutes until then, inf where it is not known yet; None where no
-      change is known ahead.
-    limits: lowest and highest target of the thermostat, degC.
+    measured: measurement of the reactors. light: valid counts of fluorescence, else nan.
+    rows: reactors with a new sample. believed: those whose OD is valid.
+    minute: time of the sample, min since the run began. elapsed: min since the schedule began, nan before.
+    phase: step of the schedule, -1 before. setpoint: OD. temperature: the schedule's target, degC.
+    following, left_min: next setpoint, and minutes until it, inf while it is not announced; both None if the schedules
+      announce no change. limits: lowest and highest target of the thermostat, degC.
     """
 
     measured: Measurement
@@ -72,10 +71,10 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What a signal reports for a sample.
+    """Report of a signal on a sample.
 
-    columns: of the recording, (N,) each. why: further reasons for the journal. warnings: a line for each reactor that
-    has one, None for the others; empty: no warnings.
+    columns: values for the recording, (N,) each. why: further values for the journal. warnings: a text or None for each
+    reactor; empty: no warnings.
     """
 
     columns: Mapping[str, Array] = field(default_factory=dict)
@@ -84,11 +83,11 @@ class Findings:
 
 
 class Signal(Protocol):
-    """A quantity that is held, structurally.
+    """Interface of a controlled quantity.
 
-    name: under which its state is saved. actuator: name of what acts on it, "" for nothing. columns: that it adds to a
-    recording, behind those of signals before it. Of a column NAME and one NAME_setpoint the summary gives the errors of
-    every window. sees_light: whether it needs the fluorescence, which the device then measures.
+    name: key of its saved state. actuator: name of the actuator that it commands, "" for none. columns: columns that it
+    adds to a recording; for a pair NAME and NAME_setpoint the summary has the errors of every window.
+    sees_light: whether the device must measure fluorescence for it.
     """
 
     name: str
@@ -99,79 +98,79 @@ class Signal(Protocol):
     def columns(self) -> tuple[str, ...]: ...
 
     def decide(self, sample: Sample) -> Array:
-        """Watch a sample and decide on a command, (N,), in the unit of the actuator: mL/s, degC.
+        """Process a sample; return the command to the actuator in its unit, mL/s or degC, (N,).
 
-        It is cut to the actuator's limits; one that is nan leaves the schedule's, and means 0 to a pump.
+        The loop cuts the command to the actuator's limits. For nan the schedule's target stays; a pump then gets 0.
         """
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """Report on the sample. Args: given: the command to the actuator as cut, in the unit of `decide`, (N,)."""
+        """Report on the sample. Args: given: the command after the actuator's limits, in the unit of `decide`, (N,)."""
 
     def dosed(self, volume_ml: Array, kept_ml: Array, pump: NDArray[np.intp]) -> None:
-        """Take what went in since this was last called, and what was put off to the next dose, mL, (N,).
+        """Process the volume delivered since the last call, mL, (N,).
 
-        Args: pump: number of the pump that gave it, 1 for the feed, (N,).
+        Args: kept_ml: volume deferred to the next dose, mL, (N,). pump: number of the pump, 1 for the feed, (N,).
         """
 
     @property
     def memory(self) -> Remembers | None:
-        """What a resumed run continues, the signal itself as a rule; None where there is nothing to remember."""
+        """Object with the saved state, usually the signal itself; None without a state."""
 
 
 Count = tuple[int, float, float, float]
-"""What was counted in a sample: number of the reactor, value, its sd, minute of the run at which it was drawn."""
+"""Result of a counted sample: number of the reactor, value, its sd, and minute of the run at which it was drawn."""
 Span = tuple[float, float]
 Answer = tuple[str, bool]
-"""The outcome of a sample as text, and whether that is a warning."""
+"""Text on how a counted sample was used, and whether to show it as a warning."""
 
 
 @runtime_checkable
 class Knows(Protocol):
-    """A signal that, in a simulation, also records the true value of its estimate."""
+    """Signal that, in a simulation, also records the true value of its estimate."""
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
-        """Take the vials themselves. Args: flow_ml_s: of a pump as the driver takes it."""
+        """Receive the simulated vials. Args: flow_ml_s: pump flow that the driver assumes, mL/s."""
 
 
 @runtime_checkable
 class Draws(Protocol):
-    """A signal with its own figures."""
+    """Signal that draws figures at the end of a run."""
 
     def draw(self, table: Any, title: str) -> Mapping[str, Any]:
-        """Draw them, by name, at the end of a run. Args: table: its recordings (`experiments/record/record.py`)."""
+        """Return name -> figure. Args: table: recordings of the run (`experiments/record/record.py`)."""
 
 
 @runtime_checkable
 class Counted(Protocol):
-    """A signal that learns from counted samples."""
+    """Signal whose estimate uses counted samples."""
 
     def counted(self, n: int, value: float, sd: float, minute: float) -> Answer:
-        """Take what was counted of reactor n at a minute of the run, with its sd; return what came of it."""
+        """Use a value counted in a sample of reactor n, and its sd; return the outcome. Args: minute: of the sample."""
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """Replay what was recorded before a resume: columns of each reactor, and every sample.
+        """Replay data from before a resume. Args: rows: recorded columns of each reactor. counted: all samples.
 
-        Args: light: lowest and highest valid counts of fluorescence.
+        light: lowest and highest valid counts of fluorescence.
         """
 
 
 class Density:
-    """The density, held by the feed pump.
+    """Signal of the density, controlled by the feed pump.
 
-    A culture of volume s V answers to a rate s u as one of V does to u, since tau = V/60. So a law whose model is of V
-    decides for every volume.
+    A culture of volume s V responds to the rate s u as a culture of volume V responds to u, since tau = V/60. So a
+    controller with a model of volume V works for every volume if its rate is multiplied by s.
 
-    A change of the setpoint that is known ahead is begun so early that OD is half-way when it comes (`half_way`): the
-    integral of the squared error is a quarter of what it is without. The aim is the next setpoint where OD lags behind
-    that way, else the way's next OD, by growth share and full pump as the law estimates them.
+    An announced change of the setpoint begins early, so that OD is half-way when the setpoint changes (`half_way`).
+    This reduces the integral of the squared error to a quarter. Meanwhile the aim is the next OD on that path, or, if
+    OD lags behind the path, the next setpoint. The path uses the growth share and full pump that `law` estimates.
 
-    Args: law: decides on the pump rate; what it can do beyond is asked of it. scale: s, (N,) or one for all.
-      max_rate: largest rate, mL/s. period_min: control period.
-    Attributes: aim: setpoint that the law was given last, (N,).
+    Args: law: controller of the pump rate. scale: s, (N,) or one for all. max_rate: largest rate, mL/s.
+      period_min: control period, min.
+    Attributes: aim: setpoint last given to the controller, (N,).
     """
 
     name, actuator = "controller", FEED.name
-    columns: tuple[str, ...] = ()  # the recording has them in any case
+    columns: tuple[str, ...] = ()  # every recording has its columns
     sees_light = False
 
     def __init__(
@@ -186,9 +185,9 @@ class Density:
         self.truth: Callable[[Array], tuple[Array, Array]] | None = None
 
     def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
-        """In a simulation: e = ln(x/r)/B and the share of the full pump at which the culture rests are known.
+        """Receive simulated vials, to record the true error e = ln(x/r)/B and the true growth share.
 
-        Args: flow_ml_s: of a pump as the driver takes it.
+        Args: flow_ml_s: pump flow that the driver assumes, mL/s.
         """
         most_s = 60.0 * bench.control_min * bench.max_rate * self._scale / flow_ml_s
 
@@ -221,7 +220,7 @@ class Density:
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(self.aim), strict=True))}
         warnings: list[str | None] = [None] * sample.rows.size
-        for key, then in (("noted", "the policy goes on"), ("alarm", "the controller on a second filter decides")):
+        for key, then in (("noted", "the policy continues"), ("alarm", "a controller with a second filter decides")):
             for n in np.flatnonzero(why.get(key, np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))):
                 warnings[n] = messages.FilterAlarm(then=then).line("reported")
         return Findings(why=why, warnings=warnings if any(warnings) else ())
@@ -236,7 +235,7 @@ class Density:
 
 
 def within_2sd(why: Mapping[str, Array]) -> dict[str, Array]:
-    """Where each estimate lies within two of its own sd of the truth: 1 or 0, nan where either is not known."""
+    """Return 1 where the true value is within two sd of its estimate, else 0; nan where either is unknown."""
     found = {}
     for name, true in zip(ESTIMATED, TRUE, strict=True):
         if true in why:
@@ -246,14 +245,14 @@ def within_2sd(why: Mapping[str, Array]) -> dict[str, Array]:
 
 
 Make = Callable[[Any, Sequence[Scenario]], Signal]
-"""From a law's config and the schedules, one for each reactor, to a signal that has seen nothing."""
+"""Function that builds a new signal from its controller's config and the schedules, one for each reactor."""
 MAKERS: dict[str, Make] = {}
 
 
 def add(name: str, make: Make) -> None:
-    """Make a signal known as `signals.NAME.kind=LAW` of deploy; its laws are registered with `signal=NAME`.
+    """Register a signal for `signals.NAME.kind=KIND` of deploy; register its controllers with `signal=NAME`.
 
-    Raises: ValueError for a name that is taken.
+    Raises: ValueError if the name is taken.
     """
     if name in (*TAKEN, *MAKERS):
         raise NameTaken(what="signal", name=name)
@@ -261,14 +260,14 @@ def add(name: str, make: Make) -> None:
 
 
 def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
-    """Build a signal of an extension. Raises: ValueError naming the signals there are, or what does not fit."""
+    """Build a signal of an extension. Raises: ValueError for an unknown signal, or from its own `make`."""
     if name not in MAKERS:
         raise messages.NoSuchSignal(name=name, known=", ".join(MAKERS) or "those of extend=FILE.py")
     return MAKERS[name](config, schedules)
 
 
 def shaped(values: Array, n: int, what: str) -> Array:
-    """Check that there is one value for each reactor; return them. Raises: ValueError naming what they are."""
+    """Return values if there is one for each of n reactors. Args: what: their name. Raises: ValueError otherwise."""
     found = np.asarray(values)
     if found.shape != (n,):
         raise messages.WrongShape(what=what, shape=found.shape, n=n)
@@ -276,9 +275,9 @@ def shaped(values: Array, n: int, what: str) -> Array:
 
 
 def fitting(signals: Sequence[Signal], actuators: Sequence[Actuator]) -> list[Signal]:
-    """Check that each signal acts by something that the reactors have, and no two by the same; return them.
+    """Check that each signal's actuator exists and that no two signals use the same; return the signals.
 
-    Raises: ValueError naming the signals, and what there is, or what a signal lacks.
+    Raises: ValueError naming the signals, also if a signal lacks a part of the interface.
     """
     known = [actuator.name for actuator in actuators]
     for k, signal in enumerate(signals):

@@ -1,8 +1,8 @@
-"""Who gives the next dose: the feed pump as the controller decides, or a spare pump that owes one.
+"""Choice of the pump that gives the next dose: the feed pump, or a spare pump with a volume due.
 
-There is one dose per sample, whichever pump gives it, so two pumps never feed at one time, and a spare pump's dose
-passes the interlock, its ledger and the waste pump's law like any other. The controller's dose of that sample is left
-out; it makes up for it at the next ones, because it sees the OD.
+Each sample has at most one dose, from one pump, so two pumps never feed at the same time. A spare pump's dose passes
+interlock, ledger and waste control like any other dose, and replaces the controller's dose of that sample. The
+controller compensates at the next samples, because it sees the OD.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,8 +22,8 @@ class Supply:
     The due volume grows by the mL/h of the step or the signal, and by the step's mL at its first sample. It is
     delivered in doses of `DOSE_ML` to `most_ml`, split equally if larger. The undelivered rest of a step is dropped.
 
-    Args: schedules: one per reactor. most_ml: largest dose. asked: pumps that a signal commands.
-    Attributes: any, whether these pumps are used; owed_ml, due volume, (N, 2); remembers, saved attributes.
+    Args: schedules: one per reactor. most_ml: largest dose, mL. asked: pumps that a signal commands.
+    Attributes: any: whether these pumps are used. owed_ml: due volume, mL, (N, 2). remembers: saved attributes.
     """
 
     def __init__(self, schedules: Sequence[Scenario], most_ml: float, asked: Collection[int] = ()) -> None:
@@ -43,13 +43,13 @@ class Supply:
         self._supplied_at, self._supplied_step = np.full(n, np.nan), np.full(n, -1)
 
     def ask(self, pump: int, rate: Array) -> None:
-        """Take a signal's command from now on. Args: rate: mean rate, mL/s, (N,); nan is 0."""
+        """Set the rate of a pump that a signal commands. Args: rate: mean rate, mL/s, (N,); nan means 0."""
         self._per_min[:, :, PUMPS.index(pump)] = 60.0 * np.nan_to_num(rate)[:, None]
 
     def due(self, elapsed: Array, phase: NDArray[np.intp], rows: Mask) -> tuple[NDArray[np.intp], Array]:
-        """Return the pump that feeds each reactor, 1, 3 or 4, and the dose of a spare pump, mL, each (N,).
+        """Return the pump of each reactor's next dose (1, 3 or 4), and the dose of a spare pump, mL, (N,) each.
 
-        Args: elapsed: min since the schedule began; phase: its step; rows: where a dose may be decided, inside it.
+        Args: elapsed: min since the schedule began. phase: step of the schedule. rows: reactors that may get a dose.
         """
         n = elapsed.size
         if not self.any:
@@ -69,6 +69,6 @@ class Supply:
         return np.where(given, np.array(PUMPS)[largest], FEED_PUMP).astype(np.intp), dose
 
     def given(self, pump: NDArray[np.intp], ml: Array) -> None:
-        """Book what was begun by each reactor's pump, mL, (N,)."""
+        """Subtract doses from the due volumes. Args: pump: number of each reactor's pump, (N,). ml: its dose, (N,)."""
         for k, spare in enumerate(PUMPS):
             self.owed_ml[:, k] -= np.where(pump == spare, ml, 0.0)

@@ -277,8 +277,9 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
                 trials.append(replace(found, temperature=np.full((2, 4), 30.0 + len(trials))))
     drawn = {d.name: d for d in comparison._drawn(trials, statistics.rows(trials))}
     assert {name: d.title for name, d in drawn.items()} == {
-        "composition_steps_laws": "steps: every law and plant", "composition_steps_shares": "steps: shares on one",
-        "composition_sine_laws": "sine: every law and plant", "composition_sine_shares": "sine: shares on two",
+        "composition_steps_laws": "steps: every controller and plant",
+        "composition_steps_shares": "steps: shares on one",
+        "composition_sine_laws": "sine: every controller and plant", "composition_sine_shares": "sine: shares on two",
     }  # fmt: skip
     curves = {key: drawn[f"composition_{key}_shares"].figure.axes for key in ("steps", "sine")}
     told = ["pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum, with preview"]
@@ -295,9 +296,9 @@ def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_p
     ("overrides", "says"),
     [
         ("studies.composition.compositions=[pid]", "studies.composition.compositions = pid: allowed"),
-        (f"{PI} studies.c.plants=[nominal] {STEPS}", "studies.c.plants = nominal: allowed those with two species"),
-        (f"{PI} {TWO} studies.c.scenarios=[day]", "studies.c.scenarios = day: allowed those with ratios"),
-        (f"+experiment=comparison {PI}", "all with compositions, or none"),
+        (f"{PI} studies.c.plants=[nominal] {STEPS}", "studies.c.plants = nominal: allowed plants with two species"),
+        (f"{PI} {TWO} studies.c.scenarios=[day]", "studies.c.scenarios = day: allowed scenarios with ratios"),
+        (f"+experiment=comparison {PI}", "all have compositions, or all have none"),
         ("composition_policies.pi=x.npz", "composition_policies = pi: allowed dqn, dqn_preview"),
     ],
 )

@@ -219,7 +219,7 @@ def test_what_cannot_be_built_is_said_in_one_line():
         registry.config("pid", SHARE)
     with pytest.raises(ValueError, match=r"^composition = dqn: needs a policy"):
         registry.build(registry.config("dqn", SHARE), SHARE)
-    with pytest.raises(ValueError, match=r"^composition = optimum: plans the whole program"):
+    with pytest.raises(ValueError, match=r"^composition = optimum: needs the whole schedule"):
         registry.build(registry.config("optimum", SHARE), SHARE)
     with pytest.raises(ValueError, match=r"^policy = .*logit_next.*env=coculture trains"):
         law("dqn", policy=linear_policy(COCULTURE_PREVIEW, "rate"))

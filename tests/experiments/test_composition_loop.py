@@ -232,7 +232,7 @@ def test_of_two_cultures_each_is_warned_of_by_its_own_share_goal_and_thermostat(
         assert step(composition, minute).warnings == [None, None]
     first, second = step(composition, 180.0).warnings
     assert first is None
-    stuck = "share_stuck: share 0.30, wanted 0.05, no nearer for 3.0 h with the thermostat at 36.0 degC; reported"
+    stuck = "share_stuck: share 0.30, setpoint 0.05, not nearer for 3.0 h with the thermostat at 36.0 degC; reported"
     assert second.startswith(stuck)
     keeper.width = np.array([0.5, 0.2])  # type: ignore[assignment]
     for minute in np.arange(190.0, 290.0, 10.0):
@@ -390,10 +390,12 @@ def test_what_is_said_of_a_counted_share_is_that_reactors() -> None:
     keeper = Told()
     composition = held(keeper, [HOLD, HOLD])
     keeper.shares = np.array([0.11, 0.52])
-    assert composition.counted(1, 0.44, 0.03, 7.0) == ("estimated 0.520 before it; 0.440 after it", False)
+    assert composition.counted(1, 0.44, 0.03, 7.0) == ("estimate 0.520 without the count; 0.440 with the count", False)
     np.testing.assert_allclose(keeper.shares, [0.11, 0.44])
     said, doubtful = composition.counted(0, 0.44, 0.03, 7.0)  # .33 off, sds .03 and .051
-    assert said.endswith("; 6 sds from it, if the share has not moved since: right reactor, right species?")
+    assert said.endswith(
+        "; the count is 6 standard deviations off: check reactor and species, unless the share changed"
+    )
     assert doubtful
 
 

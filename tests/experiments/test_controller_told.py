@@ -321,7 +321,7 @@ def test_a_share_is_counted_in_the_reactor_it_was_drawn_from_and_light_is_judged
     loop.retell([{"od": [0.5]}], [(1, 0.25, 0.02, 7.5)])
     assert knows.told == [(1, 0.25, 0.02, 7.5), ([{"od": [0.5]}], [(1, 0.25, 0.02, 7.5)], (40.0, 65534.0))]
     nobody, _ = turns(reactors, *[Scenario()] * 2)
-    assert nobody.counted("M1", 0.25, 0.02, 7.5) == ("left out: nothing here estimates it", True)
+    assert nobody.counted("M1", 0.25, 0.02, 7.5) == ("ignored: no estimator uses this measurement", True)
 
 
 def test_a_spare_pump_s_dose_is_as_large_as_the_bench_allows_in_a_period() -> None:

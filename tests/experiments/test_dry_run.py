@@ -160,7 +160,10 @@ def test_who_would_hold_the_share_is_told() -> None:
     text = told("backend=emulator", "scenario=ratio_steps", "composition=dqn_preview", "controller=pi")
     assert text.splitlines()[0] == "controller pi; share: dqn_preview; at_end hold"
     shares = [line.partition("its time")[2] for line in table(text)["M1"] if " its time" in line]
-    assert shares == ["", *(f"; share {share}, which decides the temperature" for share in ("0.3", "0.7", "0.3"))]
+    assert shares == [
+        "",
+        *(f"; share {share}, whose controller decides the temperature" for share in ("0.3", "0.7", "0.3")),
+    ]
 
 
 def test_what_the_run_would_refuse_is_refused() -> None:

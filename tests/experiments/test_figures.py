@@ -477,7 +477,7 @@ def test_the_temperature_of_equal_growth_is_where_both_curves_cross() -> None:
     first = replace(PairConfig().first, polynomial=(0.07727, -1.66))
     growth = pair_figure(replace(PairConfig(), first=first), [[], []]).axes[0]
     assert growth.lines[-1].get_xdata() == pytest.approx([crossing] * 2, abs=2e-3)
-    assert growth.get_legend().get_texts()[-1].get_text() == f"alike at {crossing:.2f} °C"
+    assert growth.get_legend().get_texts()[-1].get_text() == f"equal growth at {crossing:.2f} °C"
 
 
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])

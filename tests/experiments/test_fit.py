@@ -170,7 +170,9 @@ def test_the_thermostat_s_limits_are_those_of_the_pair_at_each_end_that_nobody_s
     alone = replace(TWO, safety=SafetyConfig(**given))
     assert assemble.completed(alone).safety == alone.safety  # of one species none are set
     narrow = replace(config, safety=SafetyConfig(composition_low=26.0, composition_high=28.6))
-    with pytest.raises(frame.UserError, match=r"= 26 to 28\.6 degC: allowed a range that holds 28\.65 degC, where E"):
+    with pytest.raises(
+        frame.UserError, match=r"= 26 to 28\.6 degC: allowed a range that includes 28\.65 degC, where E"
+    ):
         assemble.completed(narrow)
 
 
@@ -213,7 +215,7 @@ def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_
     assert (whole.backend.plant, whole.backend.pair) == ("coculture", "ecoli_psyringae")
     assert (whole.composition.kind, whole.plant) == ("midpoint", plain.plant)
     said = "composition=midpoint backend.plant=coculture backend.pair=ecoli_psyringae"
-    assert f"the scenario asks for a share: {said}\n" in caplog.text
+    assert f"set because the scenario has a composition: {said}\n" in caplog.text
     mixed = replace(plain, backend=replace(plain.backend, plant="coculture_mixed"))
     assert assemble.completed(mixed).backend.plant == "coculture_mixed"
     usual = build(PlantConfig(), presets.load("plant/nominal_noise"), "plant")
@@ -221,7 +223,7 @@ def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_
     with caplog.at_level("INFO"):
         simulated = assemble.completed(replace(TWO, **SHARES, plant=usual))
     assert simulated.plant.second.present
-    assert "the scenario asks for a share: plant=coculture\n" in caplog.text
+    assert "set because the scenario has a composition: plant=coculture\n" in caplog.text
 
 
 def test_what_a_backend_does_not_take_over_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

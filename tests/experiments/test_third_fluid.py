@@ -247,7 +247,7 @@ def test_a_signal_without_a_part_is_refused() -> None:
     ("changes", "said"),
     [
         ({"backend": UNIT}, "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube"),
-        ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug acts by the pump 4; these reactors have feed pump"),
+        ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug needs the pump 4, .* use one of feed pump"),
         ({"signals": {"drug": FOURTH}}, "signals.drug of M0: Pump4 has no tube"),
         ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* with signals.drug"),
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),
@@ -402,7 +402,7 @@ def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: py
     [
         (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
         (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
-        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat; allowed one"),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light use the same actuator, thermostat"),
     ],
 )
 def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
@@ -424,11 +424,11 @@ def test_names_and_actuators_are_used_once() -> None:
     with pytest.raises(NameTaken):
         signals.add("interlock", light.Light)
     held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
-    with pytest.raises(ValueError, match="light and light act by the same thermostat"):
+    with pytest.raises(ValueError, match="light and light use the same"):
         signals.fitting(held, [THERMOSTAT])
     with pytest.raises(NameTaken):
         agents.add("dqn", type("Other", (), {}), Any, (), "Nothing.")  # type: ignore[arg-type]
     with pytest.raises(NameTaken):
         tasks.add("density", type("Other", (), {}), Any, "Nothing.")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"signals\.dark: .*allowed .*light"):
+    with pytest.raises(ValueError, match=r"signals\.dark: .*use one of light"):
         signals.made("dark", None, [SCHEDULE])

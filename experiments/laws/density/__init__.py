@@ -1,3 +1,3 @@
-"""Density controllers: from readings to pump rates, batch first, free of torch and files; and their estimator.
+"""Density controllers and their estimator: from readings to pump rates, batch first, without PyTorch and files.
 
-Closed loops import it through `experiments.laws.registry`."""
+Closed loops import this package through `experiments.laws.registry`."""

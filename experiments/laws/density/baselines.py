@@ -1,4 +1,4 @@
-"""Simple baselines: a threshold turbidostat, a gain-scheduled proportional controller and a constant rate."""
+"""Simple controllers: threshold turbidostat, gain-scheduled proportional control, and constant rate."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from conf.schema import require, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this value, which has a logarithm
+LOWEST_OD = 1e-3  # a lower reading or setpoint counts as this value, so that its logarithm exists
 
 
 @dataclass(frozen=True)
 class ThresholdConfig(ControllerConfig):
-    """Full rate above the setpoint, none below."""
+    """Settings of the threshold controller, which pumps above the setpoint only."""
 
     kind: str = setting("threshold", "controller")
     rate: float = setting(MAX_PUMP_RATE, "rate while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
@@ -21,7 +21,7 @@ class ThresholdConfig(ControllerConfig):
 
 
 class Threshold:
-    """u = rate from x > setpoint until x <= setpoint - hysteresis, else 0: the classic turbidostat."""
+    """Classic turbidostat: u = rate from x > setpoint until x <= setpoint - hysteresis, else 0."""
 
     remembers = ("on",)
 
@@ -41,36 +41,36 @@ class Threshold:
 
 @dataclass(frozen=True)
 class GainScheduledConfig(ControllerConfig):
-    """The table: growth rate and proportional gain at each temperature. By default mu falls as in the paper."""
+    """Table of growth rate and proportional gain over temperature; the default mu changes as in the paper."""
 
     kind: str = setting("gain_scheduled", "controller")
-    temperatures: tuple[float, ...] = setting((30.0, 37.0), "of the table, rising", "degC", within=(0, 60), some=True)
+    temperatures: tuple[float, ...] = setting((30.0, 37.0), "rising temperatures", "degC", within=(0, 60), some=True)
     mu: tuple[float, ...] = setting((0.027, 0.03), "growth rate at each temperature", "1/min", within=(0, 0.1))
     gain: tuple[float, ...] = setting(
-        (0.5, 0.5), "fraction of ln(x/r) to remove in one control period, at each temperature", within=(0, 2)
+        (0.5, 0.5), "fraction of ln(x/r) removed per control period, at each temperature", within=(0, 2)
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         degc, rising = self.temperatures, sorted(set(self.temperatures))
-        require(list(degc) == rising, "controller.temperatures", degc, "rising values, each one once")
+        require(list(degc) == rising, "controller.temperatures", degc, "strictly rising values")
         for name in ("mu", "gain"):
             column = getattr(self, name)
-            require(len(column) == len(degc), f"controller.{name}", column, f"{len(degc)} values, as temperatures")
+            require(len(column) == len(degc), f"controller.{name}", column, f"{len(degc)} values, one per temperature")
 
 
 class GainScheduled:
-    """Proportional control with feed-forward, both from a table by vial temperature: gain scheduling.
+    """Proportional control with feed-forward; gain and growth rate come from a table over vial temperature.
 
       u = clip(tau (mu(T) + K(T) ln(x/r) / h), 0, u_max)
 
-    mu(T) (1/min) and K(T) (dimensionless) come from the table, linear between its entries and constant beyond them; h
-    is the control period (min), u is in mL/s, shape (N,). If mu(T) is true, ln(x/r) shrinks by 1 - K a period. In ln x
-    the plant is an integrator at each temperature, so the default K is the same for all. T is the last known
-    temperature, initially the last of the table. Source: gain scheduling as in Rugh and Shamma 2000, Automatica
-    36:1401; the paper's introduction names such controllers.
+    mu(T) (1/min) and K(T) (dimensionless) are interpolated linearly in the table and constant beyond its ends; h is
+    the control period (min), u is in mL/s, shape (N,). If mu(T) is true, each period multiplies ln(x/r) by 1 - K. In
+    ln x the plant is an integrator at every temperature, so the default K is constant. T is the last known
+    temperature, initially the highest of the table. Gain scheduling: Rugh and Shamma 2000, Automatica 36:1401; the
+    paper's introduction mentions such controllers.
 
-    Args: config: the table; model: tau, control period and largest pump rate.
+    Args: config: the table. model: tau, control period and largest pump rate.
     """
 
     remembers = ("degc", "rate")
@@ -96,16 +96,16 @@ class GainScheduled:
 
 @dataclass(frozen=True)
 class HoldConfig(ControllerConfig):
-    """A constant rate. With a correct model mu tau keeps any OD constant."""
+    """Settings of a constant pump rate. With a correct model, the rate mu tau keeps any OD constant."""
 
     kind: str = setting("hold", "controller")
     rate: float | None = setting(
-        None, "pump rate; null: mu tau of the model, 0.01 for the nominal one", "mL/s", within=(0, 0.05)
+        None, "pump rate; null: mu tau of the model (0.01 for the nominal model)", "mL/s", within=(0, 0.05)
     )
 
 
 class Hold:
-    """u = constant: a chemostat. `model` is the calibrated growth model."""
+    """Chemostat: constant pump rate u. Args: model: growth model that gives the default rate."""
 
     def __init__(self, config: HoldConfig, model: EnvConfig) -> None:
         self.rate = model.mu * model.tau if config.rate is None else config.rate

@@ -11,38 +11,38 @@ from conf.schema import check, setting
 from envs.task import EnvConfig
 from experiments.laws.base import Array, Mask, usable
 
-USUAL = 0.75  # mean square of an innovation on a sound reactor
-SHARE_SD = 0.02  # change of the growth share at rest besides the filter's error of it
+USUAL = 0.75  # mean square of the innovations, in units of their sd, while the model holds
+SHARE_SD = 0.02  # sd of changes of the growth share at rest that the filter does not model
 LOG_OD, MU, GAIN, WARMTH = range(4)
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """Constants of the filter; a certificate has them beside the settings."""
+    """Constants of the filter; a certificate contains them and the settings."""
 
-    lowest_od: float = 0.005  # below it the logarithm of a reading is meaningless
-    gain_range: tuple[float, float] = (0.2, 3.0)  # of the relative pump gain; a head outside is broken
-    noise_range: tuple[float, float] = (0.1, 100.0)  # of the learned variance over the assumed one
+    lowest_od: float = 0.005  # lower readings count as this OD, because their logarithm is meaningless
+    gain_range: tuple[float, float] = (0.2, 3.0)  # relative pump gain of a working pump head
+    noise_range: tuple[float, float] = (0.1, 100.0)  # learned variance divided by the assumed variance
     trend_weight: float = 0.4  # weight of the newest innovation in the running mean
-    calm: float = 1.5  # a mean within this many sd is no sign of a change
-    farthest: float = 3.0  # limit of an innovation in sd
-    last: int = 10  # newest readings monitored for too large innovations ...
-    long: int = 40  # ... and for too small ones
-    loud: float = 21.0  # sum of the last squares above which the filter is wrong: less than one false alarm a day
-    quiet: float = 6.0 / 40.0  # mean of the long window below which its sd is too large
+    calm: float = 1.5  # a running mean up to this many sd does not indicate a change
+    farthest: float = 3.0  # larger innovations count as this many sd
+    last: int = 10  # number of readings monitored for too large innovations
+    long: int = 40  # number of readings monitored for too small innovations
+    loud: float = 21.0  # alarm above this sum of the last 10 squares; gives less than one false alarm a day
+    quiet: float = 6.0 / 40.0  # alarm below this mean of the last 40 squares: the filter's sd is too large
 
 
 FIXED = Fixed()
-TREND_SD = (FIXED.trend_weight / (2.0 - FIXED.trend_weight)) ** 0.5  # of that mean while the model holds
+TREND_SD = (FIXED.trend_weight / (2.0 - FIXED.trend_weight)) ** 0.5  # sd of the running mean while the model holds
 
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """Prior of sensor and plant, and active parts of the filter.
+    """Settings of the filter, with the sources of the defaults.
 
-    Measured noise of a reading is 0.0033 OD at the floor; 0.005 is the value of the device makers' own filter.
-    mu of one medium spans 0.018 to 0.032 1/min in the literature. Heads of a pump differ up to 50 %; the measured
-    spread of a dose is 0.05 to 0.30. Growth falls by up to 40 % from 37 to 30 degC.
+    The measured noise at low OD is 0.0033 OD; the device makers' own filter uses 0.005. In the literature mu in one
+    medium is 0.018 to 0.032 1/min. Pump heads differ by up to 50 %; the measured spread of doses is 0.05 to 0.30.
+    Growth falls by up to 40 % from 37 to 30 degC.
     """
 
     kind: str = setting("kalman", "estimator")
@@ -51,40 +51,40 @@ class EstimatorConfig:
     noise_memory: float = setting(
         40.0, "readings over which the noise level is learned; 0: not learned", "readings", within=(0, 10_000)
     )
-    mu_sd: float = setting(0.012, "sd of the initial mu, around the model's", "1/min", within=(1e-5, 0.1))
+    mu_sd: float = setting(0.012, "sd of the initial mu", "1/min", within=(1e-5, 0.1))
     mu_walk: float = setting(2e-4, "random walk of mu", "1/min per sqrt(min)", within=(0, 0.01))
-    gain_sd: float = setting(0.25, "sd of the initial gain: true over calibrated flow of the pump", within=(0, 1))
+    gain_sd: float = setting(0.25, "sd of the initial gain (true flow / calibrated flow)", within=(0, 1))
     gain_walk: float = setting(2e-3, "random walk of the gain", "per sqrt(min)", within=(0, 0.1))
     warmth: float = setting(
-        0.025, "relative change of growth per degree: 0 to 40 % over 7 degrees", "1/degC", within=(0, 0.2)
+        0.025, "initial relative change of growth per degree (0 to 40 % in 7 degrees)", "1/degC", within=(0, 0.2)
     )
     warmth_sd: float = setting(
-        0.02, "sd of that initial value; 0 with warmth = 0: temperature is not used", "1/degC", within=(0, 0.2)
+        0.02, "sd of initial warmth; if both are 0, temperature is not used", "1/degC", within=(0, 0.2)
     )
     pulse_cv: float = setting(0.15, "relative spread of a dose", within=(0, 1))
     first_dose: float = setting(0.7, "fraction delivered by the first dose after a pause: 0.3 to 1", within=(0.1, 1))
-    first_dose_sd: float = setting(0.25, "sd of that fraction", within=(0, 1))
-    pause_min: float = setting(10.0, "length of such a pause", "min", within=(1, 1440))
-    growth_cv: float = setting(0.05, "spread of the growth within a minute, relative to mu (assumption)", within=(0, 1))
-    gate_sigma: float = setting(5.0, "innovation above which a reading is an outlier", "sigma", within=(2, 20))
+    first_dose_sd: float = setting(0.25, "sd of first_dose", within=(0, 1))
+    pause_min: float = setting(10.0, "shortest pause before a first dose", "min", within=(1, 1440))
+    growth_cv: float = setting(0.05, "spread of growth within a minute, relative to mu (assumption)", within=(0, 1))
+    gate_sigma: float = setting(5.0, "a reading with a larger innovation is an outlier", "sigma", within=(2, 20))
     gate_max: int = setting(
         6, "agreeing outliers in a row that are accepted; bubbles: up to 5", "readings", within=(1, 20)
     )
     gate_od: float = setting(
         0.025,
-        "a jump is accepted after one agreeing reading per this much OD, at least 2, at most gate_max; 0: gate_max",
+        "a jump of OD is accepted after jump / gate_od agreeing readings, at least 2, at most gate_max; 0: gate_max",
         "OD",
         within=(0, 1),
-        note="the smaller it is, the less harm following it does",
+        note="accepting a small jump does little harm",
     )
     hurry: float = setting(
         150.0,
-        "speed-up of the random walks while innovations agree in sign: variance times 1 + hurry (m - 1.5)^2 if their "
-        "running mean is m > 1.5 of its sd; 0: none",
+        "faster random walks while innovations agree in sign: variance times 1 + hurry (m - 1.5)^2 if their running "
+        "mean is m > 1.5 of its sd; 0: never",
         within=(0, 10_000),
     )
     recovery: bool = setting(True, "use readings before the schedule begins")
-    told: bool = setting(True, "use the volume delivered instead of the volume requested")
+    told: bool = setting(True, "use the delivered volume, not the requested volume")
 
     def __post_init__(self) -> None:
         check(self, "controller.estimator")
@@ -96,18 +96,19 @@ def fixed() -> dict[str, Any]:
 
 
 class Estimator:
-    """State z = [ln x, mu, g, w]: OD x, growth rate mu at the first temperature T0, relative pump gain g, w = dmu/dT.
+    """Kalman filter with state z = [ln x, mu, g, w] for N vials.
 
-    dt minutes after a dose V mL over the nominal volume 60 tau of the model (tau for a pump of 1 mL/s)
+    x is OD, mu the growth rate at the first temperature T0, g the relative pump gain, w = dmu/dT. After a dose of V mL
+    and dt minutes, with the nominal volume 60 tau of the model (tau for a pump of 1 mL/s):
 
       ln x <- ln x + dt (mu + w (T - T0)) - g V/(60 tau),   mu and g random walks,   y = ln(reading) = ln x + noise
 
-    which is linear for a known dose and temperature: a time-varying Kalman filter (Kalman 1960), exact without
-    linearising. Further parts: the noise level is learned from the innovations. A reading beyond `gate_sigma` is
-    ignored unless following readings agree, and then only OD is reset. The first dose after a pause is expected to be
-    smaller. mu and g may change faster while innovations agree in sign.
+    This is linear for a known dose and temperature, so a time-varying Kalman filter (Kalman 1960) is exact. Further
+    parts: the filter learns the noise level from the innovations. It ignores a reading beyond `gate_sigma` unless the
+    following readings agree with it; then it resets only OD. It expects a smaller first dose after a pause. mu and g
+    may change faster while innovations agree in sign.
 
-    Args: config: prior and parts; model: mu, tau, control period and largest pump rate, the initial estimate.
+    Args: config: settings. model: initial mu, tau, control period and largest pump rate.
     """
 
     remembers = (
@@ -125,29 +126,29 @@ class Estimator:
         self.cov = np.tile(np.diag([0.0, c.mu_sd**2, c.gain_sd**2, (c.warmth_sd * mu) ** 2]), (n, 1, 1))
         self._minute, self._thermometer, self._warm, self._first_warm = (np.full(n, np.nan) for _ in range(4))
         self._given_ml, self._idle_min = np.zeros(n), np.zeros(n)
-        self._heard = False  # volumes delivered are reported
+        self._heard = False  # whether delivered volumes are reported
         self._noise, self._learned = np.ones(n), np.zeros(n)
         self._far, self._far_surprise = np.zeros(n, dtype=np.int64), np.zeros(n)
         self._trend = np.zeros(n)  # running mean of the innovations in units of their sd
-        self._squares = np.full((n, FIXED.long), np.nan)  # squares of the newest of them
+        self._squares = np.full((n, FIXED.long), np.nan)  # squares of the newest innovations
 
     def dosed(self, volume_ml: Array) -> None:
         if self.config.told:
             self._given_ml, self._heard = volume_ml + (self._given_ml if self._heard else 0.0), True
 
     def decided(self, rate: Array) -> None:
-        """Take the decided pump rates, mL/s, (N,); they count as delivered until volumes are reported."""
+        """Process the decided pump rates, mL/s, (N,); they count as delivered until volumes are reported."""
         if not self._heard:
             self._given_ml = 60.0 * self.model.control_min * rate
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Take the temperatures and, with `recovery`, the readings of `rows`; arguments as `see`."""
+        """Store the temperatures and, with setting `recovery`, process the readings of `rows`, as `see` does."""
         self._thermometer = np.where(np.isfinite(temperature), temperature, self._thermometer)
         if self.config.recovery:
             self.see(od, minute, rows)
 
     def see(self, od: Array, minute: Array, rows: Mask) -> None:
-        """Take the new readings of `rows`, each shape (N,); nan is no reading."""
+        """Update the estimates with the new readings of `rows`; arrays (N,); nan is no reading."""
         idx = np.flatnonzero(usable(od, rows) & ~(minute <= self._minute))
         if not idx.size:
             return
@@ -161,13 +162,13 @@ class Estimator:
             self._given_ml[idx] = 0.0
 
     def _assumed(self, reading: Array) -> Array:
-        """Variance of the logarithm of a reading, before the level of the noise is learned."""
+        """Return the assumed variance of the logarithm of a reading, without the learned noise level."""
         return np.asarray(np.hypot(self.config.noise_floor, self.config.noise_relative * reading) ** 2 / reading**2)
 
     def ahead(self, steps_min: Array, volume_ml: Array) -> Array:
-        """Predict ln of readings after steps of so many minutes, each after a dose, (K,) of one vial: mean, sd, (K, 2).
+        """Predict ln of the readings of one vial after K further steps: mean and sd, (K, 2), without a change of state.
 
-        What it knows does not change.
+        Args: steps_min: length of each step, (K,). volume_ml: dose at the start of each step, (K,).
         """
         future, one, found = copy(self), np.zeros(1, dtype=np.intp), []
         future.mean, future.cov, future._idle_min = self.mean.copy(), self.cov.copy(), self._idle_min.copy()
@@ -181,7 +182,7 @@ class Estimator:
         return np.reshape(found, (-1, 2))
 
     def _warmer(self, idx: NDArray[np.intp]) -> Array:
-        """Return the mean temperature since the previous reading, relative to the first, degC; 0 if unknown."""
+        """Return the mean temperature since the last reading minus the first temperature, degC; 0 if unknown."""
         now = self._thermometer[idx]
         before = np.where(np.isfinite(self._warm[idx]), self._warm[idx], now)
         self._first_warm[idx] = np.where(np.isfinite(self._first_warm[idx]), self._first_warm[idx], now)
@@ -189,9 +190,9 @@ class Estimator:
         return np.asarray(np.nan_to_num(0.5 * (now + before) - self._first_warm[idx]))
 
     def _predict(self, idx: NDArray[np.intp], dt: Array, warmer: Array) -> None:
-        """Advance the rows `idx` by dt minutes, the dose, and the temperature difference."""
+        """Predict the state of the rows `idx` after the dose and dt minutes. Args: warmer: as `_warmer` returns."""
         c, n = self.config, idx.size
-        dose = self._given_ml[idx] / (60.0 * self.model.tau)  # ln of the dilution by a normal pump
+        dose = self._given_ml[idx] / (60.0 * self.model.tau)  # decrease of ln OD by a pump of gain 1
         first = (self._idle_min[idx] >= c.pause_min) & (dose > 0.0)
         self._idle_min[idx] = np.where(dose > 0.0, 0.0, self._idle_min[idx] + dt)
         arrives = np.where(first, c.first_dose, 1.0)
@@ -206,7 +207,7 @@ class Estimator:
         self.cov[idx] = np.einsum("nij,njk,nlk->nil", step, self.cov[idx], step) + noise
 
     def _update(self, idx: NDArray[np.intp], y: Array, assumed: Array, began: Mask) -> None:
-        """Update the rows `idx` with y = ln OD and its assumed variances."""
+        """Update the rows `idx` with readings y = ln OD. Args: assumed: variances. began: had a reading before."""
         c, mean, cov = self.config, self.mean[idx], self.cov[idx]
         surprise = y - mean[:, LOG_OD]
         variance = assumed * self._noise[idx]
@@ -215,7 +216,7 @@ class Estimator:
         agrees = np.abs(surprise - self._far_surprise[idx]) < c.gate_sigma * np.sqrt(2.0 * variance)
         self._far[idx] = np.where(far, np.where(agrees, self._far[idx], 0) + 1, 0)
         self._far_surprise[idx] = surprise
-        # A first reading, or a persistent jump, resets only the OD.
+        # A first reading or a persistent jump resets only the OD.
         jump = np.abs(np.expm1(surprise)) * np.exp(mean[:, LOG_OD])
         asked = np.clip(np.ceil(jump / c.gate_od), 2, c.gate_max) if c.gate_od else c.gate_max
         anew = ~began | (self._far[idx] >= asked)
@@ -236,7 +237,7 @@ class Estimator:
         self._trend[idx] = np.where(anew, 0.0, np.where(far, self._trend[idx], trend))
 
     def _learn(self, idx: NDArray[np.intp], observed: Array) -> None:
-        """Learn the noise variance over the assumed one, as an average that begins with five readings' weight of 1."""
+        """Update the ratio of noise variance to assumed variance: a running mean that starts as five readings of 1."""
         if not self.config.noise_memory:
             return
         self._learned[idx] += 1.0
@@ -246,7 +247,7 @@ class Estimator:
 
     @property
     def gain(self) -> Array:
-        """Relative pump gain within its possible range, (N,)."""
+        """Relative pump gain, cut to its possible range, (N,)."""
         return np.asarray(np.clip(self.mean[:, GAIN], *FIXED.gain_range))
 
     @property
@@ -264,12 +265,12 @@ class Estimator:
 
     @property
     def loudness(self) -> Array:
-        """Sum of squares of the last ten innovations in units of their sd, each at most 9; normally about 8."""
+        """Sum of squares of the last ten innovations in units of their sd, each cut to 9; usually about 8."""
         return np.asarray(np.nansum(self._squares[:, -FIXED.last :], axis=1))
 
     @property
     def square(self) -> Array:
-        """Square of the newest innovation in units of its sd, at most 9, (N,); nan before the second reading."""
+        """Square of the newest innovation in units of its sd, cut to 9, (N,); nan before the second reading."""
         return np.asarray(self._squares[:, -1])
 
     @property
@@ -282,10 +283,10 @@ class Estimator:
             return np.asarray(self._squares.mean(axis=1) < FIXED.quiet)
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the filter's standard deviations of the error e and of the growth share s of `relative`, each (N,).
+        """Return the filter's standard deviations of error e and growth share s, (N,) each.
 
-        To first order, with the covariances of ln x, mu and g: at rest mu = g u / tau is known better than either. For
-        e, B counts as known, as in the proof, which treats an error of the gain separately.
+        They are first-order and use the covariances of ln x, mu and g: at rest, mu = g u / tau is known better than mu
+        or g. For e, B is assumed exact, because the proof treats an error of the gain separately.
         """
         warmer = np.nan_to_num(self._warm - self._first_warm)
         share, period = self.relative(setpoint)[1], self.model.control_min / self.full_pump
@@ -294,9 +295,9 @@ class Estimator:
         return np.sqrt(self.cov[:, LOG_OD, LOG_OD]) / self.full_pump, np.sqrt(np.maximum(variance, 0.0))
 
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the standard deviations for the user: with B's uncertainty in e, scaled by recent innovations.
+        """Return the standard deviations for the user: e with the uncertainty of B, both scaled by recent innovations.
 
-        The sd of s refers to the growth share at rest, which has a further change.
+        The sd of s refers to the growth share at rest, so it includes SHARE_SD.
         """
         _, share = self.doubt(setpoint)
         slope = np.zeros((len(share), 4))
@@ -309,6 +310,6 @@ class Estimator:
         return error * larger, np.hypot(share * larger, SHARE_SD)
 
     def explain(self) -> dict[str, Array]:
-        """Explain the estimates: OD, growth rate (1/min), relative pump gain, sd of a reading over the assumed one."""
+        """Return OD, growth rate (1/min), relative pump gain, and a reading's sd divided by the assumed sd."""
         od, mu, gain = np.exp(self.mean[:, LOG_OD]), self.mean[:, MU].copy(), self.mean[:, GAIN].copy()
         return {"od_estimate": od, "mu": mu, "gain": gain, "noise": np.sqrt(self._noise)}

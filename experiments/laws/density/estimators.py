@@ -14,35 +14,35 @@ from hardware.memory import Remembers
 
 
 class DensityEstimator(Remembers, Protocol):
-    """Estimates of error e = ln(x/r)/B and growth share s = mu h/B of N vials (`envs/relative.py`), structurally.
+    """Interface of an estimator of error e = ln(x/r)/B and growth share s = mu h/B of N vials (`envs/relative.py`).
 
-    For each sample a controller calls `watch`, `see`, `relative` and the rest, then `decided`; `dosed` comes in
-    between.
+    For each sample a controller calls `watch`, `see`, the methods that return estimates, and `decided`. Between two
+    samples it calls `dosed`.
     """
 
     def reset(self, n: int) -> None:
-        """Forget everything; N rows."""
+        """Reset the state for n vials."""
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """Take a sample, also before control begins, as `Watches.watch`."""
+        """Process a sample, also before control begins, as in `Watches.watch`."""
 
     def see(self, od: Array, minute: Array, rows: Mask) -> None:
-        """Take the sample of a decision; `rows` are usable."""
+        """Process a sample for which the controller decides; only `rows` have a usable reading."""
 
     def decided(self, rate: Array) -> None:
-        """Take the decided rates, mL/s, (N,), for the case that volumes delivered are not reported."""
+        """Process the decided pump rates, mL/s, (N,); they are used if delivered volumes are not reported."""
 
     def dosed(self, volume_ml: Array) -> None:
-        """Take the volume delivered since the last call, mL, (N,)."""
+        """Process the volume delivered since the last call, mL, (N,)."""
 
     def relative(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return e and s now, each (N,)."""
+        """Return the current estimates of e and s, (N,) each."""
 
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the sd of both for the comparison with a certificate's bounds, each (N,)."""
+        """Return the sd of e and s for the comparison with a certificate's bounds, (N,) each."""
 
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the sd of both for the user, each (N,)."""
+        """Return the sd of e and s reported to the user, (N,) each."""
 
     @property
     def full_pump(self) -> Array:
@@ -50,22 +50,22 @@ class DensityEstimator(Remembers, Protocol):
 
     @property
     def loudness(self) -> Array:
-        """Sum of the squares of the last ten innovations in units of their sd, each at most 9, (N,)."""
+        """Sum of the squares of the last ten innovations in units of their sd, each square cut to 9, (N,)."""
 
     @property
     def loud(self) -> Mask:
-        """Whether innovations are impossibly large, (N,)."""
+        """Whether recent innovations are far too large for a correct filter, (N,)."""
 
     @property
     def quiet(self) -> Mask:
-        """Whether they have been far too small for a long time, (N,)."""
+        """Whether innovations have been far too small for a long time, (N,)."""
 
     def explain(self) -> dict[str, Array]:
-        """Return the values behind the estimates, by name, (N,) each."""
+        """Return the values behind the estimates, name -> (N,)."""
 
 
 class EstimatorKind(NamedTuple):
-    """Function that makes an estimator from config and model, and its constants by name."""
+    """Registered estimator. config: class of its config. make: builds it. fixed: returns its constants by name."""
 
     config: type[Any]
     make: Callable[[Any, EnvConfig], DensityEstimator]
@@ -84,11 +84,11 @@ def add(
     """Register an estimator as `controller.estimator.kind=KIND`.
 
     Args:
-      kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      make: called with config and growth model.
-      fixed: constants that affect decisions; a certificate also has them.
-    Raises: ValueError for a kind that exists.
+      kind: name of the estimator; also the default of the field `kind` of `config`.
+      config: dataclass of its settings; define the fields with `conf.schema.setting`.
+      make: function that builds it from config and growth model.
+      fixed: function that returns constants that affect decisions; certificates contain them.
+    Raises: ValueError if the kind exists.
     """
     if kind in KINDS:
         raise NameTaken(what="estimator", name=kind)
@@ -96,28 +96,28 @@ def add(
 
 
 def config_at(kind: str, key: str = "controller.estimator") -> Any:
-    """Return the default config of an estimator, "": kalman. Raises: ValueError with the known kinds."""
+    """Return the default config of an estimator; kind "" means kalman. Raises: ValueError with the known kinds."""
     if (kind or "kalman") not in KINDS:
         raise NotAllowed(key=f"{key}.kind", given=kind, allowed=", ".join(KINDS))
     return KINDS[kind or "kalman"].config()
 
 
 def build(config: Any, model: EnvConfig) -> DensityEstimator:
-    """Make the estimator of a config; it starts at mu and tau of the model."""
+    """Build the estimator that a config describes; its initial estimates are mu and tau of the model."""
     return KINDS[config.kind].make(config, model)
 
 
 def settings(config: Any) -> dict[str, Any]:
-    """Return all settings and constants of the estimator of a config, by name: `estimator.KEY`, `filter.KEY`."""
+    """Return all settings (`estimator.KEY`) and constants (`filter.KEY`) of the estimator that a config describes."""
     own = {f"estimator.{key}": value for key, value in asdict(config).items()}
     fixed = {f"filter.{key}": value for key, value in KINDS[config.kind].fixed().items()}
     return {key: list(value) if isinstance(value, tuple) else value for key, value in (own | fixed).items()}
 
 
 class WithEstimator:
-    """A controller without an estimator, with the default estimator for information only.
+    """Wrapper that adds the default estimator to a controller; the controller decides as before.
 
-    Args: law: the controller. model: initial mu and tau of the estimator, and control period.
+    Args: law: controller without an estimator. model: control period, and the estimator's initial mu and tau.
     """
 
     def __init__(self, law: Controller, model: EnvConfig) -> None:

@@ -1,4 +1,4 @@
-"""Inverse control with the estimator: the pump rate that brings the next reading to the setpoint."""
+"""Inverse control with the estimator: it gives the pump rate that brings the next reading to the setpoint."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ class InverseConfig(ControllerConfig):
 
     kind: str = setting("inverse", "controller")
     levels: int = setting(
-        0, "number of equally spaced pump rates, of which the nearest is used; 0: any rate", within=(0, 1001)
+        0, "number of equally spaced pump rates; the nearest is used; 0: any rate is used", within=(0, 1001)
     )
     estimator: Any = part(EstimatorConfig, "settings of the estimator", estimators.config_at)
 
@@ -29,12 +29,12 @@ class InverseConfig(ControllerConfig):
 
 
 class Inverse:
-    """Certainty-equivalent inverse control: u = u_max clip(e + s, 0, 1) with the estimates of error and growth share.
+    """Inverse control u = u_max clip(e + s, 0, 1) with the estimated error e and growth share s, as if both were exact.
 
     That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range, and rounded to the nearest level if `levels` is
     set.
 
-    Args: config: settings of the estimator; model: mu, tau, control period and largest pump rate, the initial estimate.
+    Args: config: levels, settings of the estimator. model: control period, largest pump rate, initial mu and tau.
     """
 
     remembers = ("estimator", "rate")

@@ -1,4 +1,4 @@
-"""The exported DQN policy as a controller of (OD, setpoint), without memory, or of estimated (error, growth share)."""
+"""DQN policies as controllers: from OD and setpoint, or from the estimated error and growth share with a supervisor."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,25 +15,25 @@ from experiments.laws.base import Array, Controller, ControllerConfig, Mask, usa
 from experiments.laws.density import estimators
 from experiments.laws.density.estimator import EstimatorConfig
 
-WATCHED = 2.0  # number of sd that count as the error of an estimate
-LOUDER = 1.5  # loudness of the policy's filter over that of the second one, above which the second one knows better
-NOTED = 36.0  # loudness that is worth a note, whoever knows better
+WATCHED = 2.0  # this many sd count as the error of an estimate
+LOUDER = 1.5  # alarm only if the loudness of the policy's filter is this many times that of the second filter
+NOTED = 36.0  # a larger loudness of the policy's filter is noted, whatever the second filter's
 
 
 @dataclass(frozen=True)
 class LearnedConfig(ControllerConfig):
-    """Settings of a learned controller; the policy's file has all others, including the estimator's."""
+    """Settings of a learned controller. The policy's file has all other settings, also those of the estimator."""
 
     kind: str = setting("dqn", "controller")
     estimator: dict[str, Any] = setting(
-        {}, "policy in relative coordinates: replaces settings of its file, e.g. estimator.noise_memory=0"
+        {}, "changed settings of the estimator of a policy in relative coordinates, e.g. estimator.noise_memory=0"
     )
 
 
 def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: EstimateBounds | None) -> Controller:
-    """Build the controller that fits a policy's observation.
+    """Build the controller for a policy: absolute (OD, setpoint) or relative (error, growth share).
 
-    Args: bounds: of the policy's certificate; None without one. Raises: ValueError for unknown or unsuitable settings.
+    Args: bounds: from the policy's certificate, or None. Raises: ValueError for unknown or invalid settings.
     """
     if policy.observation != RELATIVE:
         return LearnedController(policy)
@@ -41,7 +41,7 @@ def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: Est
 
 
 def _estimator(policy: Policy, changes: Mapping[str, Any]) -> Any:
-    """Apply changes to the settings of a policy's file; another kind starts from its defaults. Raises: ValueError."""
+    """Return the estimator's config: from the policy's file (or defaults, for another kind), with changes applied."""
     filed = policy.metadata.get("estimator", {})
     kind = str(filed.get("kind", ""))
     if (asked := str(changes.get("kind", kind))) != kind:
@@ -51,9 +51,9 @@ def _estimator(policy: Policy, changes: Mapping[str, Any]) -> Any:
 
 
 def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Collect the settings that affect decisions besides a policy's network; a certificate also has them.
+    """Return all settings, other than the network, that affect a policy's decisions; a certificate contains them.
 
-    Args: changes: of its estimator. Raises: ValueError for unknown or unsuitable settings.
+    Args: changes: changed settings of its estimator. Raises: ValueError for unknown or invalid settings.
     """
     if policy.observation != RELATIVE:
         return {}
@@ -63,9 +63,9 @@ def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) 
 
 
 class LearnedController:
-    """u = actions[argmax_a Q([od, setpoint], a)] (paper, section 3).
+    """Controller u = actions[argmax_a Q([od, setpoint], a)] (paper, section 3).
 
-    Args: policy: as read by `dqn.policy.load`.
+    Args: policy: policy that observes OD and setpoint.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -73,7 +73,7 @@ class LearnedController:
         self._q = np.zeros((0, policy.actions.size), dtype=np.float32)
 
     def reset(self, n: int) -> None:
-        """Forget the last explanation; there is no other memory."""
+        """Reset the explanation; there is no other state."""
         self._q = np.full((n, self.policy.actions.size), np.nan, dtype=np.float32)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
@@ -90,23 +90,23 @@ class LearnedController:
 
 
 def lead(q: np.ndarray) -> dict[str, Array]:
-    """Return the best Q value and its lead over the second best, each (N,); q: (N, A)."""
+    """Return the best Q value, and its lead over the second best, (N,) each. Args: q: (N, A)."""
     ranked = np.sort(q.astype(np.float64), axis=1)
     return {"q_best": ranked[:, -1], "q_lead": ranked[:, -1] - ranked[:, -2]}
 
 
 class RelativeController:
-    """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s of the `Estimator`.
+    """Controller u = u_max actions[argmax_a Q([e, s], a)] with the estimated error e and growth share s, supervised.
 
-    A supervisor watches the estimator. The one-line controller u = u_max clip(e + s, 0, 1) decides, on a second filter
-    with fixed settings (docs/certificate.md, The supervisor), while twice the sd of e or s is beyond the bounds of the
-    certificate, or while innovations are far too large, or far too small for long, and those of the second filter are
-    not. The error of s is the largest distance of the s that the policy observes from the true one, between 0 and the
-    highest proven s: above that no pump rate holds the culture.
+    The supervisor (docs/certificate.md, The supervisor) replaces the policy by the one-line controller
+    u = u_max clip(e + s, 0, 1), with e and s of a second filter with fixed settings, in two cases. 1: twice the sd of e
+    or s exceeds the bounds of the certificate. 2: the innovations of the policy's filter are far too large, or far too
+    small for a long time, and those of the second filter are not. In case 1 the error of s is the largest possible
+    distance between true and observed s, for a true s from 0 to the highest proven s; no pump rate holds a culture
+    above that.
 
-    Args: policy: with observation (error, growth_share). estimator: its settings. model: mu, tau, control period and
-      largest pump rate; the filters start at mu and tau. bounds: of the certificate; None: only innovations are
-      monitored.
+    Args: policy: policy that observes (error, growth_share). estimator: config of its estimator. model: control period,
+      largest pump rate, and the initial mu and tau of both filters. bounds: from the certificate; None: only case 2.
     """
 
     remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm", "noted")
@@ -147,7 +147,7 @@ class RelativeController:
         return self._rate.copy()
 
     def _outside(self, setpoint: Array, observation: Array) -> Mask:
-        """Return whether the estimate may exceed the proven errors, (N,)."""
+        """Return where the errors of e or s may exceed the certificate's bounds, (N,)."""
         if self.bounds is None:
             return np.zeros(setpoint.size, dtype=np.bool_)
         error, doubt = (WATCHED * sd for sd in self.estimator.doubt(setpoint))
@@ -162,7 +162,7 @@ class RelativeController:
             each.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """Return whether the supervisor decided, the policy's inputs with their sd, and the estimates, each (N,)."""
+        """Return the supervisor's flags, the policy's inputs with their sd, its Q values, and the estimates."""
         flags = {"supervised": self._supervised, "alarm": self._alarm, "noted": self._noted}
         said = {name: flag.astype(np.float64) for name, flag in flags.items()}
         (error, share), (error_sd, share_sd) = self._seen.T.copy(), self._sure.T.copy()

@@ -1,4 +1,4 @@
-"""Model predictive control of OD on the training model, solved by particle swarm or by gradient."""
+"""Model predictive control of OD with the growth model, solved by particle swarms or by gradient."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from conf.schema import check, part, require, setting
 from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
-LOWEST_OD = 1e-3  # a lower reading counts as this: the model cannot grow from zero
+LOWEST_OD = 1e-3  # a lower reading counts as this OD, because the model cannot grow from zero
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class SwarmConfig:
     """Settings of the particle swarms.
 
     Inertia and attraction are Clerc and Kennedy's constriction coefficients in inertia form. 40 particles and 120
-    iterations end within 1 % of the optimum from every one of 400 random cold starts.
+    iterations ended within 1 % of the optimum from each of 400 random cold starts.
 
-    Raises: ValueError also where particles would not converge: c1 + c2 = 2 attraction must stay below
+    Raises: ValueError also if particles would not converge: c1 + c2 = 2 attraction must be below
       24 (1 - w^2) / (7 - 5 w), the bound of order-2 stability (Poli 2009; in the review of Bonyadi & Michalewicz 2017,
       Evolutionary Computation 25:1, section 3).
     """
@@ -27,7 +27,7 @@ class SwarmConfig:
     particles: int = setting(40, "particles per swarm", within=(2, 10_000))
     iterations: int = setting(120, "iterations per swarm", within=(1, 10_000))
     inertia: float = setting(0.7298, "weight of a particle's velocity", at_least=0.0, below=1.0)
-    attraction: float = setting(1.49618, "weight of the pull to a particle's own best and to the swarm's best position")
+    attraction: float = setting(1.49618, "weight of the pull to a particle's best position and to the swarm's best")
 
     def __post_init__(self) -> None:
         check(self, "controller.swarm")
@@ -36,38 +36,38 @@ class SwarmConfig:
             0.0 < self.attraction < bound,
             "controller.swarm.attraction",
             self.attraction,
-            f"0 < attraction < {bound:.4f} for inertia = {self.inertia}, beyond which the swarm does not contract; "
+            f"0 < attraction < {bound:.4f} for inertia = {self.inertia}, because else the swarm does not converge; "
             "lower one of them",
         )
 
 
 @dataclass(frozen=True)
 class MpcConfig(ControllerConfig):
-    """The paper's receding-horizon controller; `gradient` is L-BFGS-B with the exact gradient, as a cross-check."""
+    """Settings of the paper's receding-horizon controller. Solver `gradient`: L-BFGS-B with the exact gradient."""
 
     kind: str = setting("mpc", "controller")
     horizon: int = setting(
         5,
-        "prediction horizon in periods of 1 min (paper); only the first move is applied (paper: control horizon 1 min)",
+        "prediction horizon (paper: 5 periods of 1 min); only the first move is applied",
         "control periods",
         within=(1, 60),
     )
     penalty: float = setting(
-        100.0, "cost of a move outside [0, max_pump_rate] (paper)", above=0.0, note="or the pump's range costs nothing"
+        100.0, "cost of a move outside [0, max_pump_rate] (paper)", above=0.0, note="else the range has no effect"
     )
-    solver: str = setting("pso", "optimiser; pso: the paper's", choices=("pso", "gradient"))
-    swarm: SwarmConfig = part(SwarmConfig, "particle swarm; the paper states no numbers")
+    solver: str = setting("pso", "optimiser; the paper uses pso", choices=("pso", "gradient"))
+    swarm: SwarmConfig = part(SwarmConfig, "particle swarm; the paper states no values")
     seed: int = setting(0, "random seed of the swarms", at_least=0)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """min over v of  sum_{k=0}^{H-1} [(x_k - r)^2 + penalty * (v_k outside [0, 1])] + (x_H - r)^2.
+    """Problem: minimise over v  sum_{k=0}^{H-1} [(x_k - r)^2 + penalty * (v_k outside [0, 1])] + (x_H - r)^2.
 
-    v_k = u_k / u_max are the moves as fractions of the largest pump rate, x_{k+1} = f(u_k) x_k the model's step with
-    the integrator and sub-steps of `envs.task.step_factors`. (x_0 - r)^2 is the same for all v and left out.
+    The moves v_k = u_k / u_max are fractions of the largest pump rate. x_{k+1} = f(u_k) x_k is the model's step with
+    the integrator and sub-steps of `envs.task.step_factors`. The constant (x_0 - r)^2 is left out.
 
-    start: measured OD, shape (R,); setpoint: r, shape (R,); model: mu, tau, period, integrator; penalty: see above.
+    start: measured OD x_0, shape (R,). setpoint: r, shape (R,). model: mu, tau, period, integrator.
     """
 
     start: Array
@@ -76,7 +76,7 @@ class Problem:
     penalty: float
 
     def factors(self, v: Array) -> tuple[Array, Array]:
-        """Return f(u_max v) and df/dv, shape of v; in closed form, for ten thousand calls per decision."""
+        """Return f(u_max v) and df/dv, each with the shape of v; in closed form, which is fast."""
         m = self.model
         h = m.control_min / m.substeps
         slope = -h * m.max_pump_rate / m.tau
@@ -109,14 +109,14 @@ class Problem:
         return self._reached(self.factors(v[:, None])[0])[:, 0]
 
     def by_gradient(self, start: Array) -> Array:
-        """Optimise moves by L-BFGS-B in the box [0, 1] from `start`, row by row, shape (R, H)."""
+        """Return the best moves, by L-BFGS-B in the box [0, 1], row by row. Args: start: first guess, (R, H)."""
         from scipy.optimize import minimize
 
         moves = np.empty_like(start)
         for row in range(start.shape[0]):
             one = Problem(self.start[row : row + 1], self.setpoint[row : row + 1], self.model, self.penalty)
             guess = np.clip(start[row], 0.0, 1.0)
-            # The cost is of the order of the smallest OD error that matters, squared; scaled up for the solver's tests
+            # The cost is a squared OD error, far below 1; it is scaled up for the solver's convergence tests.
             found = minimize(
                 one.value_and_gradient, guess, args=(1e4,), jac=True, method="L-BFGS-B",
                 bounds=[(0.0, 1.0)] * guess.size, options={"ftol": 1e-14, "gtol": 1e-9, "maxiter": 200},
@@ -125,7 +125,7 @@ class Problem:
         return moves
 
     def value_and_gradient(self, v: Array, scale: float = 1.0) -> tuple[float, Array]:
-        """Return the cost inside the box and its exact gradient for the single row of a problem, both times `scale`.
+        """Return the cost inside the box and its exact gradient, both times `scale`, for a problem with a single row.
 
         dx_j/dv_k = x_j f'(v_k)/f(v_k) for j >= k, so the gradient is a reversed cumulative sum.
         """
@@ -137,7 +137,7 @@ class Problem:
 
 
 def _power(base: Array, exponent: int) -> Array:
-    """Return base**exponent by repeated squaring: several times faster than a general power."""
+    """Return base**exponent by repeated squaring, which is several times faster than `**`."""
     result = np.ones_like(base)
     while exponent:
         if exponent & 1:
@@ -155,18 +155,18 @@ def minimise(
     rngs: Sequence[np.random.Generator],
     config: SwarmConfig,
 ) -> tuple[Array, Array]:
-    """Minimise R costs over R^H by R particle swarms with a global best (Kennedy & Eberhart 1995).
+    """Minimise R cost functions of H variables by R particle swarms with a global best (Kennedy & Eberhart 1995).
 
       v <- w v + c r1 (own best - x) + c r2 (swarm's best - x),   x <- x + v,   r1, r2 uniform per dimension
 
-    Particles start at rest in [low, high] and may leave it; the cost must penalise that.
+    Particles start at rest in the box [low, high]. They may leave the box; the cost must penalise that.
 
     Args:
-      cost: positions (R, P, H) -> costs (R, P); swarm r's costs may depend on r only.
-      low, high: box the particles are scattered over.
-      start: one place per swarm where a particle begins, shape (R, H), e.g. the last solution shifted by a step.
+      cost: function from positions (R, P, H) to costs (R, P); row r is the cost function of swarm r.
+      low, high: limits of the box in every variable.
+      start: first position of one particle per swarm, (R, H), e.g. the last solution shifted by a step.
       rngs: one generator per swarm, so that swarms are independent.
-    Returns: best positions (R, H) and their costs (R,). Raises: nothing; `SwarmConfig` has checked the search.
+    Returns: best positions (R, H) and their costs (R,).
     """
     swarms, dimensions = start.shape
     particles = config.particles
@@ -195,11 +195,11 @@ def minimise(
 
 
 class Mpc:
-    """Every minute: measure, minimise `Problem` over the horizon, apply the first move.
+    """Model predictive controller: at each sample it minimises `Problem` over the horizon and applies the first move.
 
-    Each solution, shifted by one period, is the start of one particle (or of the gradient) in the next period.
+    The solution, shifted by one period, is the first guess of the next period (for the swarm, of one particle).
 
-    Args: config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
+    Args: config: horizon, penalty, solver. model: mu, tau, control period, integrator and largest pump rate.
     """
 
     remembers = ("moves", "predicted", "rate", "rngs")  # with the swarms' random streams
@@ -209,7 +209,7 @@ class Mpc:
         self.reset(1)
 
     def reset(self, n: int) -> None:
-        """See `Controller.reset`. The swarms' random streams start anew: one per reactor, the same for every n."""
+        """Reset the state and the random streams, one per reactor; stream i is the same for every n."""
         steady = np.clip(self.model.mu * self.model.tau / self.model.max_pump_rate, 0.0, 1.0)
         self._moves = np.full((n, self.config.horizon), steady)
         self._predicted = np.full((n, self.config.horizon), np.nan)
@@ -225,12 +225,12 @@ class Mpc:
                 moves, _ = minimise(problem.cost, 0.0, 1.0, start, [self._rngs[i] for i in idx], self.config.swarm)
             else:
                 moves = problem.by_gradient(start)
-            # A penalty of 100 is too small if the OD error itself costs as much: at the 12 to 14 of a failed read.
+            # For an OD error above 10, as of a failed reading (12 to 14), the error costs more than the penalty of 100.
             moves = np.clip(moves, 0.0, 1.0)
             self._moves[idx], self._predicted[idx] = moves, problem.predict(moves)
             self._rate[idx] = moves[:, 0] * self.model.max_pump_rate
         return self._rate.copy()
 
     def explain(self) -> dict[str, Array]:
-        """Explain the last decision by its plan: pump rates in mL/s and predicted OD, both (N, horizon)."""
+        """Return the plan of the last decision: pump rates in mL/s and predicted OD, (N, horizon) each."""
         return {"planned_rate": self._moves * self.model.max_pump_rate, "predicted_od": self._predicted.copy()}

@@ -1,4 +1,4 @@
-"""The reference: dynamic programming on the controlled plant itself."""
+"""Oracle: dynamic programming with exact knowledge of the simulated plant, as a reference for other controllers."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,14 +12,14 @@ from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask
 
 SECONDS = 60.0  # per min
-SPAN = (0.05, 4.0)  # OD over setpoint that the value function covers
+SPAN = (0.05, 4.0)  # range of OD / setpoint that the value function covers
 GRID = 3001
 DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
 
 
 @dataclass(frozen=True)
 class OracleConfig(ControllerConfig):
-    """Action grid and discount. 129 levels contain the learned policy's 17; finer grids have no measurable effect."""
+    """Settings of the oracle. 129 levels include the learned policy's 17; more levels have no measurable effect."""
 
     kind: str = setting("oracle", "controller")
     levels: int = setting(129, "number of pump rates on [0, max_pump_rate]", within=(2, 1001))
@@ -30,23 +30,23 @@ class OracleConfig(ControllerConfig):
 def _value(
     mu: float, tau: float, control_min: float, max_rate: float, levels: int, gamma: float, grid: int
 ) -> OptimalPolicy:
-    """Solve setpoint 1 for one vial; the model is linear in x, so V_s(x) = s^2 V_1(x/s) for any setpoint s."""
+    """Solve one vial for setpoint 1. The model is linear in x, so V_r(x) = r^2 V_1(x/r) for any setpoint r."""
     model = EnvConfig(mu, tau, control_min=control_min, n_actions=levels, max_pump_rate=max_rate, start_od=SPAN)
     return solve(model, gamma, np.array([1.0]), grid)
 
 
 class Oracle:
-    """u = argmin_u (y(u) - r)^2 + gamma r^2 V(y(u)/r), with y(u) the next reading of a noise-free sensor.
+    """Controller u = argmin_u (y(u) - r)^2 + gamma r^2 V(y(u)/r), with y(u) the next reading of a noise-free sensor.
 
     It knows for each vial: the current growth rate (drawn mu, substrate, temperature, drift), flow, dead time and
-    shortest pulse of the pump head, the volume, and the noise-free reading, which it uses instead of the reading. V is
-    that of the vial's drawn mu and tau = volume/(60 flow). It does not know later draws: spread of the next dose, noise
-    of the next reading, drift within the next minute; nor priming and the wall. So it is the bound on `nominal`, and on
-    other plants the value of full knowledge of the present.
+    shortest pulse of the pump head, the volume, and the noise-free reading, which replaces the noisy one. V belongs to
+    the vial's drawn mu and tau = volume/(60 flow). It does not know the spread of the next dose, the noise of the next
+    reading, the drift within the next minute, priming and wall growth. So it bounds all controllers on `nominal`; on
+    other plants it shows the benefit of knowing the present state.
 
     Args:
-      config: action grid and discount; plant: the vials it controls, in the order of the rows; model: control period
-      and largest pump rate; flow_ml_s: flow with which the backend converts a rate to an on-time.
+      config: action grid and discount. plant: the controlled vials, in the order of the rows. model: control period
+      and largest pump rate. flow_ml_s: flow with which the backend converts a rate to an on-time, mL/s.
     """
 
     def __init__(self, config: OracleConfig, plant: Plant, model: EnvConfig, flow_ml_s: float = 1.0) -> None:
@@ -61,12 +61,14 @@ class Oracle:
         self._values = np.stack([s.value[0] for s in solved])
 
     def reset(self, n: int) -> None:
-        """Check the number of vials; there is no memory. Raises: ValueError unless n is the plant's number of vials."""
+        """Check that the plant has n vials; there is no state to reset. Raises: ValueError."""
         if n != self.plant.n:
-            raise ValueError(f"oracle of a plant with {self.plant.n} vials: allowed {self.plant.n} reactors, not {n}")
+            raise ValueError(
+                f"oracle: {n} reactors, but the plant has {self.plant.n} vials; use {self.plant.n} reactors"
+            )
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
-        """See `Controller.act`; the reading itself is not used."""
+        """Return pump rates as `Controller.act`; the argument `od` is not used."""
         plant = self.plant
         after = plant.expected_od(self.model.control_min, self._on_s + np.zeros(plant.n))
         seen = plant.sensor.apparent(after, plant.culture.wall, plant.minutes)

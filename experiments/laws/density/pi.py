@@ -1,4 +1,4 @@
-"""PI control of OD: the Chi.Bio's on-board controller, and a tuned one."""
+"""PI control of OD: the Chi.Bio's on-board controller, and a PI tuned by a rule."""
 
 from dataclasses import dataclass
 
@@ -22,14 +22,14 @@ class ChiBioPIConfig(ControllerConfig):
 
 
 class ChiBioPI:
-    """The Chi.Bio's `RegulateOD`, exactly (docs/device.md, Regulation).
+    """Exact copy of the Chi.Bio's `RegulateOD` (docs/device.md, Regulation).
 
-    With x the reading, x' the one before, r the setpoint, e = x - r and dt the minutes between the last two recorded
-    times (which are those of the two cycles before this one, because a cycle is recorded after its decision):
+    x is the reading, x' the previous reading, r the setpoint, e = x - r, and dt the minutes between the previous two
+    cycles, because the device records the time of a cycle after its decision:
 
       P  = ln(x/r) / dt / (240/V) for x > 0, else 0; times 0.7 if |x - x'| < 0.1, unless I2 is reset
       I1 = 0 if e < 0.01; else I1 + 0.1 e if |x - x'| < 0.05 and e > 0.025; else I1
-           (for a gasket that makes the pump deliver too little)
+           (compensates for a gasket that reduces the pump's flow)
       I2 = 0 if |e| > 0.1 and |x - x'| < 0.05; else I2 + 0.01 e if |x - x'| < 0.1; else I2
       u  = clip(P + I1 + I2, 0, 0.02); 0 if x - x' > 0.04 (noise guard); 0 in the first two cycles
 
@@ -80,7 +80,7 @@ class ChiBioPI:
 
 @dataclass(frozen=True)
 class TunedPIConfig(ControllerConfig):
-    """Settings of the tuning rule; mu, tau and the largest pump rate come from the model."""
+    """Settings of the tuned PI; mu, tau and the largest pump rate come from the model."""
 
     kind: str = setting("pi_tuned", "controller")
     delay_min: float = setting(1.0, "delay until a decision is visible: one control period", "min", within=(0.5, 60))
@@ -91,17 +91,17 @@ class TunedPIConfig(ControllerConfig):
 
 
 class TunedPI:
-    """PI on the logarithm of OD, tuned by a rule, with anti-windup.
+    """PI controller of the logarithm of OD, tuned by the SIMC rule, with anti-windup.
 
-    In z = ln(x/r) the plant is an integrator, z' = mu - u/tau, with mu as a step disturbance; so
+    In z = ln(x/r) the plant is an integrator, z' = mu - u/tau, with mu as a step disturbance. The controller is
 
       u = tau (K z + I),   I <- I + K dt z / T,   K = 1 / (t_c + delay),   T = 4 (t_c + delay)
 
-    which is the SIMC rule for an integrating process with dead time (Skogestad 2003, J. Process Control 13:291). With
-    its tight setting t_c = delay = one control period, the sampled closed loop has the double pole 0.75. Anti-windup:
-    I is constant while u is at a bound and z would push it further.
+    by the SIMC rule for an integrating process with dead time (Skogestad 2003, J. Process Control 13:291). With the
+    rule's tight setting, t_c = delay = one control period, the sampled closed loop has the double pole 0.75.
+    Anti-windup: I stays constant while u is at a bound and z would push u beyond the bound.
 
-    Args: config: the rule's two times; model: mu, tau, control period and the largest pump rate.
+    Args: config: the rule's two times. model: mu, tau, control period and largest pump rate.
     """
 
     remembers = ("integral", "p", "rate")
