@@ -198,8 +198,8 @@ def test_only_the_asked_rows_are_judged(read: Read) -> None:
     one = read(tidy(u=changed(U, 25, -0.02)))
     assert one.row.tolist() == [i for i in range(40) if i != 25]
     assert one.notes == ("row 25: pump ran backwards: dropped; the rate before is assumed to continue",)
-    for rows, said in (((38, 60), "38:60: 2 rows lie"), ((35, None), "35:: 5 rows lie"), ((0, 5), "0:5: 5 rows lie")):
-        with pytest.raises(RecordingError, match=f"rows = {said} there; the file has rows 0:40"):
+    for rows, said in (((38, 60), "38:60: selects 2"), ((35, None), "35:: selects 5"), ((0, 5), "0:5: selects 5")):
+        with pytest.raises(RecordingError, match=f"rows = {said} rows; the file has rows 0:40"):
             read(tidy(), rows=rows)
 
 
