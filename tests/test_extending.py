@@ -157,7 +157,7 @@ def test_a_task_with_a_config_of_its_own_trains(tmp_path: Path) -> None:
         np.testing.assert_array_equal(stored["actions"], np.linspace(0.0, 0.2, 5))
     events = b"".join(path.read_bytes() for path in (tmp_path / "here").rglob("events*"))
     assert b"leak" in events
-    for flag, expected in ((["--help=all"], "share of the level that is lost"), (["--cfg", "job"], "leak: 0.1")):
+    for flag, expected in ((["--help=all"], "fraction of the level that leaks"), (["--cfg", "job"], "leak: 0.1")):
         shown = run([*words, *flag], tmp_path)
         assert shown.returncode == 0, shown.stderr
         assert expected in shown.stdout

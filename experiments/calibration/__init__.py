@@ -1,4 +1,4 @@
-"""Parts of `calibrate` besides the estimate: config, report, study of the intervals.
+"""Parts of the command `calibrate`: config, output files, study of the intervals. The estimate is in envs.
 
-Only the command may import it.
+Only commands import this package.
 """

@@ -1,4 +1,4 @@
-"""The config of `calibrate`."""
+"""Config of `calibrate`."""
 
 import re
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ class CalibrateConfig(Source):
         choices=LAWS,
     )
     setpoints: tuple[float, ...] = setting(
-        (0.5,), "setpoints of a feedback controller, in equal parts", "OD", within=(0.05, 2), some=True
+        (0.5,), "setpoints of a feedback controller, each for the same time", "OD", within=(0.05, 2), some=True
     )
     rest_min: float = setting(
-        0.0, "pause of the pump at the start of every hour, for a feedback controller", "min", within=(0, 50)
+        0.0, "pause of the pump at the start of every hour, with a feedback controller", "min", within=(0, 50)
     )
     gain: float = setting(0.1, "gain of law=proportional", "mL/s per OD", within=(0, 1))
     protocol: OpenLoop = part(OpenLoop, "protocol, culture and sensor of a simulated recording")

@@ -1,4 +1,4 @@
-"""Files of a calibration: summary.json, the environment, and twin.yaml, the plant behind the recording as a preset."""
+"""Output files of a calibration: summary.json, the environment, and twin.yaml, a plant fitted to the recording."""
 
 from dataclasses import asdict, replace
 from textwrap import wrap
@@ -26,9 +26,9 @@ Array = NDArray[np.float64]
 
 DIGITS, WIDTH = 5, 120
 LEFT = (
-    "What one recording cannot show stays at its default: dead time, shortest pulse and priming of the pump (its flow "
-    "holds for pulses as long as the recorded ones), spread between vials, slope and blank of the sensor, substrate, "
-    "temperature, wall."
+    "One recording cannot show these values, which keep their defaults: dead time, shortest pulse and priming of the "
+    "pump (its flow holds for pulses as long as the recorded ones), spread between vials, slope and blank of the "
+    "sensor, substrate, temperature, wall."
 )
 PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the window, least-squares fit run freely from its start"
 
@@ -126,7 +126,7 @@ def _drift(d: Drift | None) -> dict[str, Any] | None:
 
 
 def environment_yaml(result: Calibration, source: str) -> str:
-    """Write the environment with the fitted mu and tau, the meaning of every value, and the source of the two.
+    """Return the environment file's text: fitted mu and tau with their source, and all values with their meaning.
 
     Raises: ValueError with the value that is out of range for an environment.
     """
@@ -139,7 +139,7 @@ def environment_yaml(result: Calibration, source: str) -> str:
         f"PMSE {result.pmse_pct:.3g} %.",
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         f"# {result.verdict.line()}.",
-        *(f"# Against it: {w}." for w in result.warnings),
+        *(f"# Warning: {w}." for w in result.warnings),
     ]
     lines += map(yaml_line, entries(model))
     return "\n".join(lines) + "\n"
@@ -164,15 +164,15 @@ def plant_of(found: Twin) -> PlantConfig:
 
 
 def twin_yaml(found: Twin, source: str) -> str:
-    """Write the file's text: all values that differ from a plant's defaults, with meaning and unit.
+    """Return the plant file's text: all values that differ from a plant's defaults, with meaning and unit.
 
-    Raises: ValueError naming the value that no plant may have.
+    Raises: ValueError with the value that is out of range for a plant.
     """
     plant, (first, end) = plant_of(found), found.rows
     hours = found.knot_min[-1] / 60.0
     tau = "at the knots" if found.drifts else "constant, since the recording does not show its drift"
     said = (
-        "The plant behind a recording, written by calibrate, for deploy plant_file=FILE and benchmark plant_file=FILE.",
+        "Plant fitted to a recording by calibrate, for deploy plant_file=FILE and benchmark plant_file=FILE.",
         f"Recording {source}, rows {first}:{end}, {hours:.1f} h, a reading every {found.row_min:.3g} min. Age 0 is the "
         "first of these rows; start_min begins later.",
         f"mu at the knots, 95 %: {_band(found.mu)} 1/min.",
@@ -194,7 +194,7 @@ def twin_yaml(found: Twin, source: str) -> str:
 
 
 def yaml_line(entry: Entry) -> str:
-    """Write a value with its meaning and unit behind it."""
+    """Return a line of YAML: the value, then its meaning and unit as a comment."""
     value = entry.value
     if isinstance(value, tuple):
         text = "[" + ", ".join(_plain(v) for v in value) + "]"
@@ -217,7 +217,7 @@ def _numbers(values: Array) -> tuple[float, ...]:
 
 
 def _mean(values: Array) -> float:
-    """Over the time between evenly spaced knots."""
+    """Return the mean over time of the values at evenly spaced knots."""
     return _rounded(float(np.trapezoid(values) / (len(values) - 1)))
 
 

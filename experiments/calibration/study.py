@@ -55,7 +55,7 @@ def _setpoint(config: CalibrateConfig, times: Array, t: float) -> float:
 
 
 def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar: bool = False) -> list[Fitted]:
-    """Calibrate each of N recordings, (T,) and (N, T); or the message of a refusal."""
+    """Calibrate each of N recordings, time (T,) and values (N, T); a refused recording gives the message."""
     found: list[Fitted] = []
     for i in tqdm(range(len(od)), disable=None if bar else True):
         try:
@@ -66,10 +66,10 @@ def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar
 
 
 def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, Any]:
-    """Compare N calibrations with the true values, (N,) each: accepted, and of those the coverage, in %.
+    """Compare N calibrations with the true values, (N,) each; return the number refused and the coverage in %.
 
-    mu is compared with the mean growth rate over the recording's rows, which differs between draws if growth
-    fluctuates. wrong_pct: accepted although the true value is beyond twice the interval, of all.
+    The true mu is the mean growth rate over the recording's rows, which differs between draws if growth fluctuates.
+    wrong_pct: percentage of all N that were accepted although a true value is outside its doubled interval.
     """
     kept = [i for i, c in enumerate(found) if isinstance(c, Calibration)]
     refusals = sorted({c for c in found if isinstance(c, str)})
@@ -84,7 +84,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
 
 
 def coverage(config: CalibrateConfig, folder: Path) -> float:
-    """Return the smaller of the coverages of mu and tau by their 95 % intervals, over simulated recordings, in %."""
+    """Return the coverage of 95 % intervals over simulated recordings, in %: that of mu or of tau, the smaller one."""
     protocol, n = config.protocol, config.coverage
     title = f"{n} simulated recordings of {protocol.hours:g} h under {config.law}, {100 * protocol.noise:g} % noise"
     print(title, flush=True)
@@ -107,7 +107,7 @@ def coverage(config: CalibrateConfig, folder: Path) -> float:
                 f"{numbers['relative_half_width_pct'][name]:.1f} %"
             )
     files.write_json(folder / "summary.json", numbers)
-    first = f"; the first: {numbers['refusals'][0]}" if numbers["refusals"] else ""
+    first = f"; first reason: {numbers['refusals'][0]}" if numbers["refusals"] else ""
     print(f"refused: {numbers['refused']} of {n}{first}")
     print(f"figure and summary in {folder}")
     return worst

@@ -1,4 +1,4 @@
-"""Recordings of this program, of devices and of other labs, read from files: text, columns, doses, and what is refused.
+"""Reader of recordings of this program, of devices and of other labs.
 
-Entered by `calibrate`, `replay` and the report of a run.
+`calibrate`, `replay` and the report of a run use this package.
 """

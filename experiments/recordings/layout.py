@@ -1,4 +1,4 @@
-"""Where a recording's columns stand and what their units are, by the names or the number of its columns."""
+"""Recognition of a recording's columns and units from the names or the number of its columns."""
 
 import math
 import re
@@ -16,19 +16,19 @@ SPELT = {"sec": "s", "secs": "s", "seconds": "s", "mins": "min", "minutes": "min
 TIME = re.compile(r"((exp|elapsed|experiment)_)?time(_[a-z]+)?|(elapsed_)?(min|minutes|h|hours|seconds)|timestamp")
 OD = ("od_measured", "od", "od_reading", "avg_od_reading")
 PUMP = ("pump_rate_ml_s", "pump_rate")
-DUTY = "pump_{}_rate"  # the Chi.Bio writes the share of full power, not a flow
+DUTY = "pump_{}_rate"  # the Chi.Bio writes a fraction of full power, not a flow
 PUMPS = (1, 2, 3, 4)
 DOSE = ("dose_ml", "add_media_ml", "add_alt_media_ml", "sum_add_media_ml", "sum_add_alt_media_ml", "volume_change_ml")
 FED = ("fed_ml",)
 TEMPERATURE = ("media_temp", "temperature_degc", "temperature_c", "avg_temperature_c", "temperature")
 REACTOR = ("reactor", "pioreactor_unit")
 LIGHT = (("fluorescence",), ("fp1_base", "fp1_emit1"))  # counts; the Chi.Bio writes the emission over the base
-COLUMNS = ("time", "od", "rate", "dose", "fed", "temperature", "reactor")  # that a user can name
+COLUMNS = ("time", "od", "rate", "dose", "fed", "temperature", "reactor")  # columns that a user can name
 
 CHIBIO_POSITIONS = (0, 1, 8)  # of exp_time, od_measured, media_temp
 CHIBIO_FIRST_PUMP = 10  # position of pump_1_rate; the other three follow
 CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
-EVOLVER = "Experiment: "  # how the line above the two columns of an eVOLVER's files begins
+EVOLVER = "Experiment: "  # start of the line above the two columns of an eVOLVER's file
 
 
 class Asked(NamedTuple):
@@ -44,13 +44,13 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where time, OD, temperature and feed stand, and the factors of time and feed to house units.
+    """Columns of a recording, each by its number from 0, and the factors that convert its numbers to min and mL.
 
-    od: None in a table of doses. fed: columns of pumps that feed, or of doses. feed: what they hold: a "rate" in mL/s,
-    a "dose" in mL, the "total" of the doses so far, or nothing, "". idle: of pumps that are not counted, by number.
-    light: of the factors that make fluorescence. timed: a dose is the seconds that a pump ran.
-    minutes: nan where the column's name tells no unit. labels: of words
-    that tell rows apart, by what they name: reactor, experiment, channel, event.
+    source: name of the layout. od: None in a table of doses. fed: columns of feed pumps or doses. feed: their content:
+    "rate" (mL/s), "dose" (mL), "total" of all doses so far (mL), or "" without feed. minutes: factor of times, nan if
+    the column's name has no unit. ml: factor of the feed. idle: pump -> column, for pumps that do not count as feed.
+    labels: reactor, experiment, channel or event -> column of its names. light: columns whose product is fluorescence.
+    timed: whether a dose is given as the seconds that the pump ran.
     """
 
     source: str
@@ -69,7 +69,7 @@ class Layout:
 
     @property
     def numbers(self) -> list[int]:
-        """All columns that hold numbers, each once."""
+        """Columns of numbers, each once."""
         some = [self.time, self.od, *self.fed, *self.idle.values(), *self.light, self.temperature]
         return [place for place in dict.fromkeys(some) if place is not None]
 
@@ -77,12 +77,12 @@ class Layout:
 def recognised(path: Path, first: Sequence[str], named: bool, asked: Asked, doses: bool, alone: bool) -> Layout:
     """Recognise the columns from the first line.
 
-    Args: named: that line holds names. doses: it is a table of doses beside one of readings. alone: no such table is.
-    Raises: RecordingError naming what was looked for and found.
+    Args: named: whether this line has names. doses: whether the file is a table of doses for another file.
+      alone: whether the file has no such table. Raises: RecordingError with the columns looked for and found.
     """
     if first[0].startswith(EVOLVER):
         if alone:
-            raise RecordingError(f"{path}: an eVOLVER's OD without its pump log; give doses=.../vial0_pump_log.txt")
+            raise RecordingError(f"{path}: OD of an eVOLVER without a pump log; give doses=.../vial0_pump_log.txt")
         fed: tuple[int, ...] = (1,) if doses else ()
         od, feed = (None, "dose") if doses else (1, "")
         return Layout("eVOLVER", 0, od, None, fed, feed, UNITS["h"], asked.pump_ml_s, list(first), timed=doses)
@@ -95,8 +95,8 @@ def recognised(path: Path, first: Sequence[str], named: bool, asked: Asked, dose
         source = "Chi.Bio without header, columns by position"
         return Layout(source, *CHIBIO_POSITIONS, fed, "rate", UNITS["s"], asked.pump_ml_s, None, idle)
     raise RecordingError(
-        f"{path}: has {len(first)} columns and no header; without a header only 3 columns (minutes, OD, mL/s) or the "
-        f"Chi.Bio's own (at least {CHIBIO_COMMON_COLUMNS}) are known; add a header such as time_min,od,pump_rate_ml_s"
+        f"{path}: has {len(first)} columns and no header; a file without header needs 3 columns (minutes, OD, mL/s) or "
+        f"a Chi.Bio's {CHIBIO_COMMON_COLUMNS} or more; add a header such as time_min,od,pump_rate_ml_s"
     )
 
 
@@ -144,7 +144,7 @@ def _named(path: Path, first: Sequence[str], asked: Asked, doses: bool, alone: b
 def _feed(
     path: Path, names: Sequence[str], found: Callable[[str, Iterable[str]], list[str]], asked: Asked, own: Iterable[str]
 ) -> tuple[tuple[int, ...], str, str, dict[int, int]]:
-    """Places and kind of what was fed, its unit, and the pumps that are not counted."""
+    """Return the columns of the feed, its kind and unit, and pump -> column for pumps that do not count as feed."""
     duties = {pump: names.index(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
     if duties and not {"rate", "dose", "fed"} & {*own}:
         fed, idle = _feeding(path, duties, asked.pumps)
@@ -159,11 +159,11 @@ def _feed(
 
 
 def _feeding(path: Path, at: dict[int, int], pumps: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Columns of the pumps that feed, and pump number -> column of the others."""
+    """Return the columns of the pumps that feed, and pump -> column of the other pumps."""
     absent = [pump for pump in pumps if pump not in at]
     if absent or not pumps:
         known = ", ".join(map(str, at))
-        raise RecordingError(f"{path}: pumps = {list(pumps)}: allowed is a selection of {known}, which the file holds")
+        raise RecordingError(f"{path}: pumps = {list(pumps)}: allowed one or more of {known}, the pumps in the file")
     return tuple(at[pump] for pump in pumps), {pump: i for pump, i in at.items() if pump not in pumps}
 
 
@@ -172,10 +172,10 @@ def _plain(name: str) -> str:
 
 
 def _unit(name: str) -> str:
-    """Return the unit of a time that its name tells, "" for none."""
+    """Return the unit of time in a column's name, "" without one."""
     words = [SPELT.get(word, word) for word in name.split("_")]
     return "s" if name == "exp_time" else next((word for word in reversed(words) if word in UNITS), "")
 
 
 def _there(first: Sequence[str]) -> str:
-    return f"found {', '.join(first)[:120]}; name it by columns.od=NAME and the like ({', '.join(COLUMNS)})"
+    return f"found {', '.join(first)[:120]}; give its name as columns.KEY=NAME, KEY one of {', '.join(COLUMNS)}"

@@ -1,6 +1,6 @@
-"""A reader for the recordings of this project, of Chi.Bio, Pioreactor and eVOLVER, and for tables of readings.
+"""Reader of recordings of this project, of Chi.Bio, Pioreactor and eVOLVER, and of tables of readings.
 
-`read_recording` refuses whatever is not a usable recording, and reports what it left out of one that is.
+`read_recording` refuses an unusable recording. It notes the rows that it drops from a usable one.
 """
 
 import math
@@ -26,15 +26,15 @@ Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
 WASTE_PUMP = 2  # of the Chi.Bio; it follows the feed pump and does not dilute
-LOWEST_OD = -0.05  # blank error and noise reach this far below zero; a culture does not
+LOWEST_OD = -0.05  # blank error and noise can make an OD as low as this
 HIGHEST_OD = 10.0  # the device's own upper limit; a dead spectrometer reads 11 to 14 (docs/device.md, OD measurement)
-DENSEST_OD = 6.0  # a median above this is no OD of a culture in a vial ...
-RAW_COUNT_OD = 500.0  # ... but OD times 100, and above this a photodetector count
-FINEST_MIN, COARSEST_MIN = 0.005, 30.0  # from row to row
+DENSEST_OD = 6.0  # a median above this is OD times 100 ...
+RAW_COUNT_OD = 500.0  # ... or, above this, counts of a photodetector
+FINEST_MIN, COARSEST_MIN = 0.005, 30.0  # allowed time between rows
 HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
-RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch
+RESTART_ROWS = 5  # this many consecutive rows with earlier times are a new run, fewer are a glitch
 LISTED_RUNS = 20
-LOST_SHARE = 0.05  # more rows without a pump rate, or with one that runs backwards, are another way of working
+LOST_SHARE = 0.05  # largest fraction of rows without a pump rate, or with a negative one
 Doubts = tuple[tuple[str, str], ...]
 
 
@@ -45,13 +45,13 @@ class Recording:
     time_min: strictly increasing, shape (n,).
     od: optical density, nan where the reading was unusable, shape (n,).
     pump_rate: mL/s, held from each row to the next, shape (n,).
-    temperature: degC, nan where there is none, shape (n,).
+    temperature: degC, nan without a reading, shape (n,).
     row: number of each row in the file, counting data rows from 0, shape (n,).
-    notes: what was excluded, assumed or repaired, one sentence each.
-    doubts: what makes mu and tau wrong if it is as it looks, and what to do then.
-    source: which layout was recognised.
-    runs: first and last row number of every run in the file.
-    fluorescence: counts, nan where there are none, shape (n,).
+    notes: sentences on what was excluded, assumed or repaired.
+    doubts: (likely fault that makes mu and tau wrong, its remedy), each.
+    source: name of the recognised layout.
+    runs: numbers of the first and last row of every run in the file.
+    fluorescence: counts, nan without a reading, shape (n,).
     """
 
     time_min: Array
@@ -80,34 +80,34 @@ def read_recording(
 ) -> Recording:
     """Read a recording from a device's own file, from `Recorder`'s, or from a table.
 
-    docs/calibration.md (What it reads) has the layouts. In a file with doses a row is a reading, a dose or both, blank
-    cells are allowed, and a dose counts from the next reading on.
+    docs/calibration.md has the layouts. In a file with doses a row is a reading, a dose or both, and blank cells are
+    allowed. A dose changes the next reading.
 
     Args:
-      path: of the file.
-      pump_ml_s: flow of the feed pump at full power, mL/s, > 0; turns a Chi.Bio's duty into mL/s, and the seconds that
-        a pump ran into mL. Not used for files that hold mL or mL/s.
-      pumps: which of the Chi.Bio's pumps feed the vial, 1 to 4; their flows add up. Not used for other files.
-      run: which of several concatenated runs, from 0; None takes the one with most rows.
-      reactor: which reactor of a file with a column `reactor`; None takes the first.
-      rows: data rows [first, end) to read, counted from 0; what lies outside is not looked at. None: to the end.
+      path: path of the file.
+      pump_ml_s: flow of the feed pump at full power, mL/s, > 0; converts a Chi.Bio's duty to mL/s, and the seconds that
+        a pump ran to mL. Not used for files in mL or mL/s.
+      pumps: the Chi.Bio's pumps that feed the vial, 1 to 4; their flows are added. Not used for other files.
+      run: number of the run in a file of several runs, from 0; None: the run with most rows.
+      reactor: reactor in a file with a column `reactor`; None: the first one.
+      rows: data rows [first, end) to read, counted from 0; the others are ignored. end None: to the last row.
       doses: a second file with the doses: an eVOLVER's pump log, a Pioreactor's dosing events, or a table.
-      columns: name in the file of one of `COLUMNS`. time_unit: s, min or h, where no column's name tells it.
-    Raises: RecordingError, one line that ends in the notes so far, when the file is no recording; what can be left out
-      is left out and noted.
+      columns: entry of `COLUMNS` -> name in the file. time_unit: s, min or h, if the column's name has no unit.
+    Raises: RecordingError, one line with the notes so far, if the file is no usable recording. A few unusable rows are
+      only dropped and noted.
     """
     path = Path(path)
     if not 0.0 < pump_ml_s < math.inf:
         raise RecordingError(f"pump_ml_s = {pump_ml_s}: allowed > 0 mL/s (flow of the feed pump at full power)")
     notes: list[str] = []
     try:
-        with np.errstate(all="ignore"):  # what overflows is not finite, and is dropped as that
+        with np.errstate(all="ignore"):  # a number that overflows is not finite, so its row is dropped
             asked = Asked(pump_ml_s, pumps, reactor, rows, columns, time_unit)
             layout, table = read_table(path, None if doses is None else Path(doses), asked, notes)
             doubts = _idle_pumps(layout, table, pumps, notes)
             table = _with_times_and_rates(path, table, notes)
             backward = _backward(path, table, HIGHEST_PUMP_RATE if layout.feed == "rate" else math.inf)
-            _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
+            _note(notes, table.number[backward], "pump ran backwards: dropped; the rate before is assumed to continue")
             table = table.only(~backward)
             runs = _runs(table.time_min, np.diff(table.headers, prepend=table.headers[0]) > 0)
             keep, stale = _choose_run(path, runs, table.number, run, notes)
@@ -125,28 +125,28 @@ def read_recording(
 
 
 def _with_times_and_rates(path: Path, table: Cells, notes: list[str]) -> Cells:
-    """Keep the rows that have both. Raises: RecordingError when too many have no pump rate, or none has both."""
+    """Keep the rows with a time and a pump rate. Raises: RecordingError if too many have no rate, or none has both."""
     width = int(np.median(table.width))
     short = table.width < width
     lost = short | ~np.isfinite(table.pump_rate)
     if lost.mean() > LOST_SHARE:
         raise RecordingError(
-            f"{path}: {named_rows(table.number[lost])}: cut off or without a pump rate; that is "
+            f"{path}: {named_rows(table.number[lost])}: cut off or without a pump rate: "
             f"{100 * lost.mean():.3g} % of the rows, allowed {100 * LOST_SHARE:g} %; write the rate into every row, 0 "
-            "where the pump rests"
+            "while the pump rests"
         )
     _note(notes, table.number[short], f"fewer than {width} columns: dropped")
     table = table.only(~short)
     good = np.isfinite(table.time_min) & np.isfinite(table.pump_rate)
-    what = "time or pump rate is not a finite number: dropped, the rate before it is taken to go on"
+    what = "time or pump rate is not a finite number: dropped; the rate before is assumed to continue"
     _note(notes, table.number[~good], what)
     if not good.any():
-        raise RecordingError(f"{path}: no row has a finite time and pump rate; is it a recording?")
+        raise RecordingError(f"{path}: no row has a finite time and pump rate; check that the file is a recording")
     return table.only(good)
 
 
 def _idle_pumps(layout: Layout, table: Cells, pumps: Sequence[int], notes: list[str]) -> Doubts:
-    """Pumps that ran and are not counted. The waste pump moves at least what all others bring, and dilutes nothing."""
+    """Return a doubt if a pump ran that is not counted; a waste pump that moved as much as all others is no doubt."""
     fed = float(np.nansum(table.pump_rate))
     moved = {pump: abs(float(np.nansum(rate))) for pump, rate in zip(layout.idle, table.idle.T, strict=True)}
     ran = [pump for pump, rate in zip(layout.idle, table.idle.T, strict=True) if (np.abs(rate) > 0.0).any()]
@@ -161,21 +161,21 @@ def _idle_pumps(layout: Layout, table: Cells, pumps: Sequence[int], notes: list[
         if pump in feeds:
             _note(notes, table.number[np.abs(rate) > 0.0], f"pump {pump} ran and is not counted")
     names = " and ".join(map(str, feeds))
-    return ((f"pump {names} ran and {'is' if len(feeds) == 1 else 'are'} not counted", f"say pumps=[{counted}]"),)
+    return ((f"pump {names} ran and {'is' if len(feeds) == 1 else 'are'} not counted", f"set pumps=[{counted}]"),)
 
 
 class _Run(NamedTuple):
-    """Positions of the rows of one run, and of those left out because time did not advance."""
+    """One run. rows: positions of its rows. stale: positions of dropped rows, whose time did not advance."""
 
     rows: Numbers
     stale: Numbers
 
 
 def _runs(time: Array, starts: Mask) -> list[_Run]:
-    """Split where a header is repeated or the clock starts again; single rows behind the clock are left out.
+    """Split rows into runs at repeated headers and where the clock restarts.
 
-    A run begins at a header, or where time falls and rises over RESTART_ROWS, if that does not lead beyond the latest
-    time of the run before.
+    The clock restarts where time falls and then rises for RESTART_ROWS rows, unless these rows go beyond the latest
+    time of the run before. Other rows with an earlier time are dropped.
     """
     ahead = np.pad(time, (0, RESTART_ROWS - 1), constant_values=np.nan)
     rising = sliding_window_view(np.diff(ahead) > 0.0, RESTART_ROWS - 1).all(axis=1)
@@ -206,13 +206,13 @@ def _choose_run(path: Path, runs: Sequence[_Run], number: Numbers, run: int | No
         listed = enumerate(runs[:LISTED_RUNS])
         spans = ", ".join(f"{k}: rows {number[r.rows[0]]}-{number[r.rows[-1]]}" for k, r in listed)
         spans += f" and {len(runs) - LISTED_RUNS} more" if len(runs) > LISTED_RUNS else ""
-        why = "the longest" if run is None else "as asked"
-        notes.append(f"the file holds {len(runs)} runs ({spans}); run {chosen} is used ({why})")
+        why = "the longest" if run is None else "as requested"
+        notes.append(f"the file has {len(runs)} runs ({spans}); run {chosen} is used ({why})")
     return runs[chosen]
 
 
 def _backward(path: Path, table: Cells, highest: float) -> Mask:
-    """Rows in which the pump ran backwards, (n,). Raises: RecordingError for many, and for any impossible rate."""
+    """Return a mask, (n,), of rows with a backward pump. Raises: RecordingError for too many, or an impossible rate."""
     pump_rate, backward = table.pump_rate, table.pump_rate < 0.0
     few = backward.mean() <= LOST_SHARE
     wrong = (pump_rate > highest) | (backward & ~few)
@@ -220,7 +220,7 @@ def _backward(path: Path, table: Cells, highest: float) -> Mask:
         i = int(np.argmax(wrong))
         raise RecordingError(
             f"{path}: row {table.number[i]}: pump rate {pump_rate[i]:g} mL/s: allowed 0 to {HIGHEST_PUMP_RATE:g} mL/s; "
-            "a pump run backwards, or another unit such as mL/min (divide by 60)?"
+            "did the pump run backwards, or is the unit another one, such as mL/min (divide by 60)?"
         )
     return backward
 
@@ -236,14 +236,14 @@ def _check_spacing(path: Path, time: Array) -> None:
 
 
 def _usable_od(path: Path, od: Array, number: Numbers, notes: list[str]) -> Array:
-    """OD with nan for unusable readings, each kind noted. Raises: RecordingError when too few remain."""
+    """Return the OD with nan for unusable readings, and note each kind. Raises: RecordingError if too few remain."""
     finite = np.isfinite(od)
     middle = float(np.median(od[finite])) if finite.any() else 0.0
     if middle > DENSEST_OD:
         likely = "raw detector counts" if middle > RAW_COUNT_OD else "OD times 100"
         raise RecordingError(
-            f"{path}: OD has the median {middle:.3g}: these look like {likely}; expected an optical density of 0 to "
-            f"{HIGHEST_OD:g}; divide OD times 100 or 1000, convert counts by the blank (OD ~ log10(blank / raw))"
+            f"{path}: the median OD is {middle:.3g}: these look like {likely}; expected an optical density of 0 to "
+            f"{HIGHEST_OD:g}; divide by 100 or 1000, or convert counts with the blank (OD ~ log10(blank / raw))"
         )
     low, high = finite & (od < LOWEST_OD), finite & (od > HIGHEST_OD)
     _note(notes, number[~finite], "OD is not a finite number: reading rejected")
@@ -259,7 +259,7 @@ def _usable_od(path: Path, od: Array, number: Numbers, notes: list[str]) -> Arra
 
 
 def _note(notes: list[str], rows: Numbers, what: str) -> None:
-    """Add one sentence that names the rows it concerns."""
+    """Add a note on these rows, if there are any."""
     if len(rows):
         notes.append(f"{named_rows(rows)}: {what}")
 
@@ -277,17 +277,17 @@ class Source:
         None, "second file, with the doses: an eVOLVER's pump log, a Pioreactor's dosing_events"
     )
     columns: dict[str, Any] = setting(
-        {}, f"names in the file that are not understood: columns.od=NAME, also {', '.join(COLUMNS)}"
+        {}, f"names of columns that the program does not recognise: columns.KEY=NAME, KEY one of {', '.join(COLUMNS)}"
     )
     time_unit: str | None = setting(
-        None, "of times without date whose column names no unit, or a wrong one", choices=tuple(UNITS)
+        None, "unit of times that are not dates, if the column's name has none or a wrong one", choices=tuple(UNITS)
     )
-    rows: str | None = setting(None, "FIRST:END, data rows from 0, without END; null: all")
+    rows: str | None = setting(None, "FIRST:END: data rows to read, counted from 0, END excluded; null: all")
     run: int | None = setting(None, "run in a file of several concatenated runs, from 0; null: the longest")
     reactor: str | None = setting(None, "reactor in a file with several of them; null: the first")
     pump_ml_s: float = setting(
         1.0,
-        "flow of the feed pump at full power, where a file holds a Chi.Bio's duties or the seconds that a pump ran",
+        "flow of the feed pump at full power, for a file with a Chi.Bio's duties or the seconds that a pump ran",
         "mL/s",
         above=0.0,
         at_most=10.0,

@@ -1,4 +1,4 @@
-"""From the cells of a recording to its columns in house units, of one reactor. Nothing is judged here."""
+"""Conversion of a recording's cells to the columns of one reactor, in minutes, OD and mL/s."""
 
 import math
 from array import array
@@ -20,18 +20,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-EPOCHS = ((1e11, 6e4, "counts ms since 1970"), (1e9, 60.0, "is a date or counts s since 1970"))  # from, per min, words
+EPOCHS = ((1e11, 6e4, "counts ms since 1970"), (1e9, 60.0, "is a date or counts s since 1970"))  # least, per min, note
 MIN_ROWS = 10
-LARGEST_ML = 50.0  # of a dose
-LONGEST_S = 1e6  # of all runs of a pump
+LARGEST_ML = 50.0  # largest dose
+LONGEST_S = 1e6  # longest total time of a pump in a file
 
 
 class Cells(NamedTuple):
-    """Rows of one reactor in file order and house units; nan where a cell is no number. All have the shape (n,).
+    """The n rows of one reactor, in file order; nan for a cell that is not a number. Shape (n,) each.
 
-    time_min: of dates and times since 1970 from the first row on. idle: shape (n, pumps not counted), mL/s.
-    number: of the row among the file's data rows. width: cells in the row. headers: how many stand between the first
-    row and this one. The others are those of `Recording`.
+    time_min: a date or a time since 1970 counts from the first row. idle: mL/s of pumps that do not count as feed,
+    (n, pumps). number: number of the row among the file's data rows. width: number of cells in the row.
+    headers: number of repeated headers before the row. The other fields are those of `Recording`.
     """
 
     time_min: Array
@@ -45,12 +45,12 @@ class Cells(NamedTuple):
     headers: Numbers
 
     def only(self, keep: Mask | Numbers) -> "Cells":
-        """Return the rows of a mask, or at positions."""
+        """Return the rows that a mask or positions select."""
         return Cells._make(values[keep] for values in self)
 
 
 def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -> tuple[Layout, Cells]:
-    """Read the layout of a file and its rows. Args as of `read_recording`. Raises: RecordingError."""
+    """Read the layout of a file and its rows. Args: as of `read_recording`. Raises: RecordingError."""
     with text.readable(path):
         export = text.zipped(path)
     alone = doses is None and not export
@@ -61,13 +61,13 @@ def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -
     keep &= _chosen(path, layout, read, asked.reactor, notes)
     if (found := int(keep.sum())) < MIN_ROWS:
         span = ":".join("" if end is None else str(end) for end in asked.rows)
-        of_rows = f"rows = {span}: {found} rows lie there; the file has rows 0:{n}"
+        of_rows = f"rows = {span}: selects {found} rows; the file has rows 0:{n}"
         found_all = f"only {found} data rows"
         raise RecordingError(
             f"{path}: {found_all if asked.rows == (0, None) else of_rows}; at least {MIN_ROWS} are needed"
         )
     if doses is not None and layout.feed:
-        raise RecordingError(f"{path}: holds what was fed, and doses={doses} holds it again; drop one of them")
+        raise RecordingError(f"{path}: has a feed, and doses={doses} has it, too; drop one of the two")
     table, since_1970 = _in_house_units(path, layout, read, keep, notes)
     events = None
     if layout.timed and layout.feed != "rate" and (np.diff(table.time_min) >= 0.0).all():
@@ -83,25 +83,25 @@ def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -
 def _loaded(
     path: Path, tables: Sequence[str], asked: Asked, notes: list[str], doses: bool = False, alone: bool = False
 ) -> tuple[Layout, "_Read"]:
-    """Read a file's layout and lines. Args as of `recognised` and of `text.cells`. Raises: RecordingError."""
+    """Read a file's layout and lines. Args: as of `recognised` and of `text.cells`. Raises: RecordingError."""
     with text.readable(path):
         cells = text.cells(path, tables, notes)
         first = next(cells, None)
         if first is None:
-            raise RecordingError(f"{path}: is empty or holds no data; expected time, OD and pump rate per row")
+            raise RecordingError(f"{path}: is empty or has no data; expected time, OD and pump rate in every row")
         named = not all(cell.strip().lower() == "nan" or not math.isnan(text.number(cell)) for cell in first)
         layout = recognised(path, first, named, asked, doses, alone)
         read = _read(layout, cells if layout.header else chain([first], cells))
     if not len(read.width):
-        raise RecordingError(f"{path}: holds no complete data row; expected time, OD and pump rate in every row")
+        raise RecordingError(f"{path}: has no complete data row; expected time, OD and pump rate in every row")
     return layout, read
 
 
 class _Read(NamedTuple):
-    """What the lines hold, n rows. column: place -> numbers, shape (n,). width: cells of each row, shape (n,).
+    """Content of n rows. column: number of the column -> its numbers, (n,). width: number of cells of each row, (n,).
 
-    label: of each row, as a place in `names`, -1 where the row is cut off before it; by what it names.
-    headers: the rows before which the header is repeated.
+    label: reactor, experiment, channel or event -> index of each row's text in `names`, (n,), -1 for a row too short.
+    names: reactor, ... -> all its texts. headers: numbers of the rows before which the header is repeated.
     """
 
     column: dict[int, Array]
@@ -111,7 +111,7 @@ class _Read(NamedTuple):
     headers: list[int]
 
     def words(self, layout: Layout, what: str, rows: Mask) -> str | None:
-        """Return the first word that these rows hold for what is named, None where nothing names it."""
+        """Return the first text of these rows in the column of `what`, e.g. reactor; None without such a column."""
         codes = self.label[what][rows] if what in layout.labels else np.empty(0, dtype=np.int64)
         return self.names[what][codes[codes >= 0][0]] if (codes >= 0).any() else None
 
@@ -141,7 +141,7 @@ def _read(layout: Layout, rows: Iterable[list[str]]) -> _Read:
 
 
 def _chosen(path: Path, layout: Layout, read: _Read, reactor: str | None, notes: list[str]) -> Mask:
-    """Find the rows of one reactor, experiment and sensor, and those that are cut off before that, (n,).
+    """Return a mask, (n,), of the rows of one reactor, experiment and sensor, and of rows cut off before their names.
 
     Raises: RecordingError.
     """
@@ -155,18 +155,18 @@ def _chosen(path: Path, layout: Layout, read: _Read, reactor: str | None, notes:
         others = sorted({names[code] for code in here} - {name})
         if name not in names:
             raise RecordingError(
-                f"{path}: reactor = {name}: allowed is one of {', '.join(others)}, which the file holds"
+                f"{path}: reactor = {name}: allowed one of {', '.join(others)}, the reactors in the file"
             )
         if others and what == "experiment":
-            raise RecordingError(f"{path}: holds the experiments {name}, {', '.join(others)}; export one of them alone")
+            raise RecordingError(f"{path}: has the experiments {name}, {', '.join(others)}; export only one of them")
         if others:
-            notes.append(f"{what} {name} taken; the file also holds {', '.join(others)}")
+            notes.append(f"{what} {name} used; the file also has {', '.join(others)}")
         keep &= np.isin(read.label[what], (names.index(name), -1))
     return keep
 
 
 def _in_house_units(path: Path, layout: Layout, read: _Read, keep: Mask, notes: list[str]) -> tuple[Cells, bool]:
-    """Return the kept rows, and whether their times count from 1970; the feed is in mL where it is no rate."""
+    """Return the kept rows, with a feed in mL/s (a rate) or mL, and whether their times count from 1970."""
     column, n = read.column, len(read.width)
     light = np.prod([column[i] for i in layout.light], axis=0) if layout.light else np.full(n, np.nan)
     if len(layout.light) > 1:  # the Chi.Bio writes a base of 0 while its slot is off
@@ -191,21 +191,21 @@ def _in_house_units(path: Path, layout: Layout, read: _Read, keep: Mask, notes: 
 
 
 def _given(path: Path, total: Array, cells: Cells) -> Array:
-    """Doses of running totals, (columns, n); blank cells repeat the total before. Raises: RecordingError."""
+    """Return doses, (n,), from running totals, (columns, n); a blank cell repeats the total. Raises: RecordingError."""
     at = np.maximum.accumulate(np.where(np.isfinite(total), np.arange(total.shape[1]), 0), axis=1)
     filled = np.nan_to_num(np.take_along_axis(total, at, axis=1))
     given = np.diff(filled, axis=1, prepend=filled[:, :1]).sum(axis=0)
     again = np.diff(cells.time_min, prepend=-np.inf) <= 0.0  # another run
     if (falls := (given < -1e-9) & ~again).any():
         raise RecordingError(
-            f"{path}: row {cells.number[np.argmax(falls)]}: the total that was fed falls, which no total does: are "
-            "these single doses (dose_ml), or two runs in one file (rows=FIRST:END)?"
+            f"{path}: row {cells.number[np.argmax(falls)]}: the total feed falls, which is impossible; if these are "
+            "single doses, name the column dose_ml; of two runs in one file choose one by rows=FIRST:END"
         )
     return np.where(again, 0.0, given)
 
 
 def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, notes: list[str]) -> tuple[Array, Array]:
-    """Read a table of doses: minutes as of the readings, and mL, in order of time. Raises: RecordingError."""
+    """Read a table of doses; return minutes as for the readings, and mL, in order of time. Raises: RecordingError."""
     layout, read = _loaded(path, text.DOSED, asked._replace(time_unit=None), notes, doses=True)
     keep = np.ones(len(read.width), dtype=np.bool_)
     if reactor is not None and "reactor" in layout.labels:
@@ -216,12 +216,12 @@ def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, not
         keep &= np.isin(read.label["event"], feeds)
     table, dated = _in_house_units(path, layout, read, keep, [])
     if dated != since_1970 and len(table.od):
-        raise RecordingError(f"{path}: counts its time another way than the readings; dates in both, or in neither")
+        raise RecordingError(f"{path}: doses and readings need the same clock; write dates in both files or in none")
     return _spread(path, layout, table)
 
 
 def _spread(path: Path, layout: Layout, table: Cells) -> tuple[Array, Array]:
-    """Return minutes and mL of doses in order of time, the seconds that a pump ran in parts of one second.
+    """Return minutes and mL of doses in order of time; split a dose of a timed pump into parts of one second.
 
     Raises: RecordingError.
     """
@@ -235,16 +235,16 @@ def _spread(path: Path, layout: Layout, table: Cells) -> tuple[Array, Array]:
 
 
 def _with_rates(path: Path, table: Cells, events: tuple[Array, Array] | None) -> Cells:
-    """Turn doses into the mean rate from each reading to the next; rows without a reading go.
+    """Turn doses into the mean rate from each reading to the next, and drop rows without a reading.
 
-    A dose counts from the next reading on; so does what a row's total has grown by. The seconds that a pump ran begin
-    with their row.
+    A dose, or the growth of a total, in a row of a reading belongs to the time after this reading. The seconds that a
+    pump ran begin at their row.
     """
     is_reading = np.isfinite(table.od) & np.isfinite(table.time_min)
     is_reading[1:] &= np.diff(table.time_min) != 0.0
     at, readings = np.cumsum(is_reading) - 1, table.only(is_reading)
     if len(readings.od) < MIN_ROWS:
-        raise RecordingError(f"{path}: only {len(readings.od)} rows hold a reading; at least {MIN_ROWS} are needed")
+        raise RecordingError(f"{path}: only {len(readings.od)} rows have a reading; at least {MIN_ROWS} are needed")
     dose = table.pump_rate
     if events is not None:
         at, dose = np.searchsorted(readings.time_min, events[0], side="right") - 1, events[1]
@@ -259,18 +259,18 @@ def _with_rates(path: Path, table: Cells, events: tuple[Array, Array] | None) ->
 
 
 def _check_doses(path: Path, dose: Array) -> None:
-    """Refuse volumes that are no doses. Raises: RecordingError."""
+    """Refuse volumes that cannot be doses. Raises: RecordingError."""
     given = dose[dose > 0.0]
     if len(given) and given.max() > LARGEST_ML:
         raise RecordingError(
-            f"{path}: a dose of {given.max():g} mL: allowed {LARGEST_ML:g} mL; is it in uL, a total, or pump_ml_s?"
+            f"{path}: a dose of {given.max():g} mL: allowed up to {LARGEST_ML:g} mL; check unit (uL?) and pump_ml_s"
         )
     if len(given) >= MIN_ROWS and (np.diff(given) >= 0.0).all() and given[-1] > 3.0 * given[0]:
-        raise RecordingError(f"{path}: every dose is larger than the one before, as a total is; name its column fed_ml")
+        raise RecordingError(f"{path}: the doses never decrease, as if they were totals; name their column fed_ml")
 
 
 def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> tuple[Array, bool]:
-    """Convert times to min, and whether they count from 1970; nan for a time of another kind."""
+    """Return times in min, nan for a time of another kind than most, and whether they count from 1970."""
     known = time[np.isfinite(time)]
     middle = float(np.median(known)) if len(known) else 0.0
     for floor, per_minute, words in EPOCHS:
@@ -280,12 +280,12 @@ def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> tuple
     if len(known) and math.isnan(layout.minutes):
         assert layout.header is not None
         raise RecordingError(
-            f"{path}: column {layout.header[layout.time]} holds {known.min():g} to {known.max():g}, neither dates nor "
-            "times since 1970; name its unit by time_unit=, or as time_min, time_s or time_h"
+            f"{path}: column {layout.header[layout.time]} has {known.min():g} to {known.max():g}, neither dates nor "
+            "times since 1970; give time_unit=, or name the column time_min, time_s or time_h"
         )
     return np.where(time < EPOCHS[-1][0], layout.minutes * time, np.nan), False
 
 
 def named_rows(rows: Numbers) -> str:
-    """Row numbers as text, as ranges: '2 rows: 7-8'."""
+    """Return row numbers as text with ranges, e.g. '2 rows: 7-8'."""
     return f"{'row' if len(rows) == 1 else f'{len(rows)} rows:'} {row_spans(rows)}"

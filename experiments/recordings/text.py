@@ -1,4 +1,4 @@
-"""From a file to the cells of its lines: plain, gzipped, in a Pioreactor's export, in UTF-8 or UTF-16."""
+"""Reader of the cells of a file: plain, gzipped or a Pioreactor's export, in UTF-8 or UTF-16."""
 
 import csv
 import gzip
@@ -19,14 +19,14 @@ from hardware.errors import RecordingError
 
 GZIP, ZIP = b"\x1f\x8b", b"PK"
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
-TORN_LINES = 5  # so many lines with control characters are what power cuts leave; a file with more is binary
-READ = ("pioreactor_unit_activity_data", "pioreactor_unit_activity_data_rollup", "od_readings")  # the best first
+TORN_LINES = 5  # most lines with control characters after power cuts; a file with more is binary
+READ = ("pioreactor_unit_activity_data", "pioreactor_unit_activity_data_rollup", "od_readings")  # preferred first
 DOSED = ("dosing_events",)
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Name the file where it cannot be read. Raises: RecordingError."""
+    """Raise a RecordingError with the file's name if reading the file fails in this context."""
     try:
         yield
     except (UnicodeError, csv.Error):
@@ -36,24 +36,24 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def zipped(path: Path) -> bool:
-    """Whether a file is a zip, whole or not."""
+    """Return whether a file is a zip archive, also a damaged one."""
     with path.open("rb") as file:
         return file.read(2) == ZIP
 
 
 def _members(path: Path, names: Sequence[str], tables: Sequence[str]) -> list[str]:
-    """Find a Pioreactor's export of the first of these tables, a file for each unit. Raises: RecordingError."""
+    """List the files, one per unit, of the first of these tables in a Pioreactor's export. Raises: RecordingError."""
     for table in tables:
         if found := sorted(name for name in names if re.search(rf"(^|[/-]){table}[-.].*csv$", name)):
             return found
     held = sorted({name.partition("/")[0] for name in names if name.endswith(".csv")})
     raise RecordingError(
-        f"{path}: holds none of {', '.join(tables)}; found {', '.join(held)[:120] or 'no table'}; export it, too"
+        f"{path}: has none of {', '.join(tables)}; found {', '.join(held)[:120] or 'no table'}; export one of them"
     )
 
 
 def _texts(path: Path, tables: Sequence[str]) -> Iterator[io.TextIOWrapper]:
-    """Open the texts of a file. Args: tables: of an export, of which the first that is there is taken."""
+    """Yield the open texts of a file. Args: tables: names of tables; of an export, the first one found is read."""
     if zipped(path):
         with zipfile.ZipFile(path) as archive:
             for name in _members(path, archive.namelist(), tables):
@@ -70,9 +70,9 @@ def _text(stream: IO[bytes]) -> io.TextIOWrapper:
 
 
 def _lines(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[str]:
-    """Yield the lines of a file, without a last line that has no end: its last number may be cut.
+    """Yield the lines of a file, except a last line without line end, whose last number may be cut.
 
-    Raises: UnicodeError where the file is no text; OSError, EOFError, zlib.error and zipfile.BadZipFile.
+    Raises: UnicodeError if the file is not text; OSError, EOFError, zlib.error and zipfile.BadZipFile.
     """
     read = torn = 0
     for text in _texts(path, tables):
@@ -85,7 +85,7 @@ def _lines(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[str]
                 notes.append(f"line {i}: holds control characters, as after a power cut: dropped")
                 torn += 1
             elif i > 1 and whole and not whole.endswith("\n"):
-                notes.append(f"line {i}: has no line end, so it may be torn: dropped")
+                notes.append(f"line {i}: has no line end, so it may be incomplete: dropped")
             else:
                 yield whole
             if torn > TORN_LINES:
@@ -96,9 +96,9 @@ def _lines(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[str]
 
 
 def cells(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[list[str]]:
-    """Yield the cells of every line that is neither blank nor a comment; the first one shows what separates them.
+    """Yield the cells of every line that is neither blank nor a comment; the first line shows the separator.
 
-    Each line is read alone, so that a stray quotation mark costs one row. Args: as of `_texts`. Raises: as `_lines`.
+    Each line is parsed alone, so that a stray quotation mark spoils one row. Args: as of `_texts`. Raises: as `_lines`.
     """
     kept = (line for line in _lines(path, tables, notes) if line.strip() and not line.lstrip().startswith("#"))
     first = next(kept, "")
@@ -114,7 +114,7 @@ def cells(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[list[
 
 
 def number(cell: str) -> float:
-    """Convert a cell to a number, a date (ISO 8601, UTC unless it says otherwise) to s since 1970, else to nan."""
+    """Return the number in a cell, or s since 1970 for a date (ISO 8601, UTC without a time zone), else nan."""
     try:
         return float(cell)
     except ValueError:

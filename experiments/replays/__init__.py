@@ -1,4 +1,4 @@
-"""Replay of a recording as if it were a run: estimates, decisions, alarms, and how well it predicts.
+"""Replay of a recording as if it were a run: estimates, decisions, alarms, and quality of the predictions.
 
-Entered by `replay`.
+The command `replay` uses this package.
 """

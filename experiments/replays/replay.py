@@ -1,4 +1,4 @@
-"""A recording gone through by estimator, controller and interlock, which cannot act on it; and the loop on its twin."""
+"""Replay of a recording: estimator, controller and interlock process its readings, but cannot act on it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,12 +17,12 @@ from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 from hardware.watched import Watched
 
-AHEAD = 10  # steps
-INSIDE = 1.96  # sd of a prediction that hold 95 % of readings
+AHEAD = 10  # readings from a prediction to the predicted one
+INSIDE = 1.96  # half width of the 95 % band of a prediction, in its sds
 
 
 class _Recorded(Watched):
-    """A recording as a reactor. Args: series: of it, (K,). temperature: degC, (K,)."""
+    """A recording in place of a reactor. Args: series: its readings, (K,). temperature: degC, (K,)."""
 
     def __init__(self, series: Series, temperature: Array) -> None:
         super().__init__(("recording",))
@@ -30,7 +30,7 @@ class _Recorded(Watched):
         self.fed_ml = 60.0 * series.pump_rate[:-1] * np.diff(series.time)
 
     def measure(self) -> Measurement:
-        """Return the next reading; `repeated` returns the doses before it."""
+        """Return the next reading. `repeated` then returns the doses before this reading."""
         if self._k >= 0:
             self.seen(self.elapsed(), self.fed_ml[self._k : self._k + 1])
         self._k += 1
@@ -44,12 +44,12 @@ class _Recorded(Watched):
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """Events, and the decisions that a run would have made, at each of K readings, (K,) each.
+    """Readings of a recording, and estimates and decisions of a run on these readings, (K,) each.
 
-    believed: the interlock takes the reading for the culture's. decided_ml, given_ml: doses until the next reading.
-    mu: 1/min. gain: of the pump over its setting. low, high: 95 % band in which the reading was expected `AHEAD`
-    readings before, OD, nan where nothing was. one, ten: whether a reading lay in its band, one reading and `AHEAD`
-    before, nan where that is not known. acted: the supervisor acted. reasons: of the interlock, "" for none.
+    believed: whether the interlock accepts the reading. decided_ml: dose of the controller until the next reading.
+    given_ml: dose of the device. mu: 1/min. gain: pump flow over its setting. low, high: 95 % band of the OD predicted
+    `AHEAD` readings before, nan if unknown. one, ten: whether the reading is in the band predicted 1 or 10 readings
+    before, nan if unknown. acted: whether the supervisor acted. reasons: alarms of the interlock, "" for none.
     """
 
     setpoint: float
@@ -69,8 +69,8 @@ class Replayed:
 
     @property
     def doses(self) -> dict[str, float]:
-        """Per cent of the readings after which device and controller dose, neither does, or one of them alone."""
-        ours, theirs = self.decided_ml[:-1] > 0.0, self.given_ml[:-1] > 0.0  # after the last nobody looks
+        """Per cent of readings after which device and controller both dose, neither doses, or only one of them does."""
+        ours, theirs = self.decided_ml[:-1] > 0.0, self.given_ml[:-1] > 0.0  # the last reading has no dose after it
         each = {
             "both": ours & theirs,
             "neither": ~ours & ~theirs,
@@ -83,10 +83,10 @@ class Replayed:
 def replay(
     series: Series, temperature: Array, law: Controller, interlock: Interlock, setpoint: float, model: EnvConfig
 ) -> Replayed:
-    """Go through a recording. Doses that were decided and not given are asked for anew, never added up.
+    """Replay a recording. A dose that was decided but not given is not added to later doses.
 
-    Args: series: times from 0, min. law: decides. interlock: of one reactor, with `WatchedSafety`. model: with which an
-      estimator begins beside a law that has none.
+    Args: series: readings, with times from 0, min. law: the controller. interlock: a `WatchedInterlock` of one reactor.
+      model: initial model of the estimator that is added to a controller without one.
     """
     law = law if isinstance(law, Estimates) else WithEstimator(law, model)
     device, n = _Recorded(series, temperature), len(series.time)

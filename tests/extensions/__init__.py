@@ -1,1 +1,1 @@
-"""Files of one's own that tests load with `extend=`."""
+"""Examples of extensions, which tests load with `extend=`."""

@@ -1,4 +1,4 @@
-"""A third fluid of one's own: a drug on a spare pump that holds a culture's growth rate, whatever it gets used to."""
+"""Example of a third fluid: a drug from a spare pump holds the growth rate, even of a culture that gets used to it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ from hardware.memory import Remembers
 
 @dataclass(frozen=True)
 class StressConfig:
-    """What is asked for, and how hard it is pursued."""
+    """Config of the signal `drug` and of its controller."""
 
-    kind: str = setting("stress", "which law of the drug")
-    pump: str = setting("pump 3", "on which the drug is", choices=("pump 3", "pump 4"))
+    kind: str = setting("stress", "controller of the drug")
+    pump: str = setting("pump 3", "pump of the drug", choices=("pump 3", "pump 4"))
     growth: float = setting(0.015, "growth rate to hold", "1/min", above=0.0, at_most=0.1)
-    gain: float = setting(0.02, "more drug per excess of growth and sample", "mL/s min", at_least=0.0)
-    most: float = setting(0.004, "drug at most", "mL/s", within=(0, 0.02))
+    gain: float = setting(0.02, "increase of the rate per excess growth and sample", "mL/s min", at_least=0.0)
+    most: float = setting(0.004, "largest rate of the drug", "mL/s", within=(0, 0.02))
     memory: float = setting(8.0, "samples over which growth is averaged", "samples", at_least=1.0)
-    volume_ml: float = setting(20.0, "of a culture", "mL", above=0.0)
+    volume_ml: float = setting(20.0, "volume of a culture", "mL", above=0.0)
 
     def __post_init__(self) -> None:
         check(self, "signals.drug")
 
 
 class Stress:
-    """u <- u + gain (growth - wanted), within 0 and the most."""
+    """Controller u <- u + gain (growth - setpoint), with u from 0 to `most`, mL/s."""
 
     remembers = ("rate",)
 
@@ -50,7 +50,7 @@ class Stress:
 
 
 class Drug:
-    """Growth as averaged, and the share of the drug's own medium in the vial. See `Signal`."""
+    """Signal: averaged growth rate, and fraction of the drug's medium in the vial. `Signal` describes the members."""
 
     name, sees_light, columns = "drug", False, ("drug", "growth", "growth_setpoint")
     remembers = ("law", "growth", "share", "log_od", "minute", "given_ml")
@@ -59,7 +59,7 @@ class Drug:
         n = len(schedules)
         self.config, self.actuator, self.law = config, config.pump, registry.build(config, "drug")
         self._growth, self._log_od, self._minute = (np.full(n, np.nan) for _ in range(3))
-        self._share, self._given_ml = np.zeros(n), np.zeros(n)  # of all pumps, since the sample before
+        self._share, self._given_ml = np.zeros(n), np.zeros(n)  # volume of all pumps since the last sample
         self.law.reset(n)
 
     def decide(self, sample: Sample) -> Array:

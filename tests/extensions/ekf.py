@@ -1,4 +1,4 @@
-"""An estimator of one's own: an extended Kalman filter of OD itself and of growth, for a pump that is known."""
+"""Example of an estimator: an extended Kalman filter of OD and growth rate, for a pump of known flow."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,14 @@ from experiments.laws.density import estimators
 
 @dataclass(frozen=True)
 class EkfConfig:
-    """What it believes beforehand."""
+    """Config of the filter: noise of readings and doses, and spread of mu."""
 
-    kind: str = setting("ekf", "which estimator")
+    kind: str = setting("ekf", "estimator of the density")
     noise: float = setting(0.006, "sd of a reading", "OD", within=(1e-4, 0.1))
-    mu_sd: float = setting(0.01, "sd of the first guess of mu, around the model's", "1/min", within=(1e-5, 0.1))
+    mu_sd: float = setting(0.01, "sd of the initial mu around the model's mu", "1/min", within=(1e-5, 0.1))
     mu_walk: float = setting(3e-4, "random walk of mu", "1/min per sqrt(min)", within=(0, 0.01))
-    dose_cv: float = setting(0.15, "spread of a dose", within=(0, 1))
-    memory: float = setting(12.0, "readings over which surprises are averaged", "readings", at_least=2.0)
+    dose_cv: float = setting(0.15, "relative sd of a dose", within=(0, 1))
+    memory: float = setting(12.0, "readings over which squared innovations are averaged", "readings", at_least=2.0)
 
     def __post_init__(self) -> None:
         check(self, "controller.estimator")
@@ -29,7 +29,7 @@ FIXED = {"loud_mean_square": 3.5, "quiet_mean_square": 0.05}
 
 
 class Ekf:
-    """State [x, mu]: x <- x exp(mu dt - V/(60 tau)), mu a random walk, reading = x + noise. See `DensityEstimator`."""
+    """Filter of [x, mu]: x <- x exp(mu dt - V/(60 tau)) with dose V, mu a random walk, reading = x + noise."""
 
     remembers = ("mean", "cov", "minute", "given_ml", "heard", "square")
 
@@ -66,15 +66,15 @@ class Ekf:
         cov = np.einsum("nij,njk,nlk->nil", slope, self.cov, slope)
         cov[:, 0, 0] += (c.dose_cv * dose * x) ** 2
         cov[:, 1, 1] += c.mu_walk**2 * dt
-        surprise, total = np.nan_to_num(od) - x * step, cov[:, 0, 0] + c.noise**2
+        innovation, total = np.nan_to_num(od) - x * step, cov[:, 0, 0] + c.noise**2
         kalman = cov[:, :, 0] / total[:, None]
-        mean = np.stack([x * step, mu], axis=1) + kalman * surprise[:, None]
+        mean = np.stack([x * step, mu], axis=1) + kalman * innovation[:, None]
         cov = cov - kalman[:, :, None] * cov[:, None, 0, :]
         mean[first, 0], mean[first, 1] = np.nan_to_num(od)[first], mu[first]
         cov[first] = np.diag([c.noise**2, c.mu_sd**2])
         mean[:, 0] = np.maximum(mean[:, 0], 1e-3)
         self.mean, self.cov = np.where(new[:, None], mean, self.mean), np.where(new[:, None, None], cov, self.cov)
-        square = self._square + (np.minimum(surprise**2 / total, 9.0) - self._square) / c.memory
+        square = self._square + (np.minimum(innovation**2 / total, 9.0) - self._square) / c.memory
         self._square = np.where(new & ~first, square, self._square)
         self._minute = np.where(new, minute, self._minute)
         self._given_ml = np.where(new & self._heard, 0.0, self._given_ml)

@@ -1,4 +1,4 @@
-"""A task of one's own, whose config is a plain dataclass: a tank's level is led to a goal by an inflow; it leaks."""
+"""Example of a task with its own config: an inflow brings the level of a leaking tank to a goal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LevelConfig:
-    """A level z <- (1 - leak) z + inflow, between 0 and 1."""
+    """Config of a tank whose level follows z <- (1 - leak) z + inflow, between 0 and 1."""
 
-    kind: str = setting("level", "which task")
-    leak: float = setting(0.1, "share of the level that is lost in a step", within=(0, 1))
+    kind: str = setting("level", "kind of task")
+    leak: float = setting(0.1, "fraction of the level that leaks in a step", within=(0, 1))
     most: float = setting(0.2, "largest inflow of a step", above=0.0, at_most=1.0)
-    levels: int = setting(5, "inflows, equally spaced on [0, most]", within=(2, 100))
+    levels: int = setting(5, "number of inflows, equally spaced on [0, most]", within=(2, 100))
     long: int = setting(25, "steps of an episode", at_least=1)
 
     def __post_init__(self) -> None:
@@ -35,7 +35,7 @@ class LevelConfig:
 
 
 class LevelEnv(EpisodeVectorEnv[Any]):
-    """N tanks; observation [level, goal]; reward -(level - goal)^2."""
+    """Environment of N tanks. Observation: [level, goal]. Reward: -(level - goal)^2."""
 
     def __init__(self, n: int, config: LevelConfig) -> None:
         self._level = Level(config)
@@ -55,14 +55,14 @@ class LevelEnv(EpisodeVectorEnv[Any]):
 
 @dataclass(frozen=True)
 class _Episodes:
-    """What `EpisodeVectorEnv` asks of a config."""
+    """Values that `EpisodeVectorEnv` needs in its config."""
 
     episode_steps: int
     n_actions: int
 
 
 class Level:
-    """See `Task`."""
+    """The task. `Task` describes its members."""
 
     observation: tuple[str, ...] = ("level", "goal")
     unit = "of the tank"
@@ -114,4 +114,4 @@ class Level:
         return {}
 
 
-tasks.add("level", LevelConfig, Level, "A tank that leaks.")
+tasks.add("level", LevelConfig, Level, "The level of a leaking tank.")

@@ -1,4 +1,4 @@
-"""A signal of one's own: the light of a culture of two species, held by the thermostat; the colder, the brighter."""
+"""Example of a signal: the thermostat holds the light of a culture of two species, which is brighter when colder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from hardware.memory import Remembers
 
 @dataclass(frozen=True)
 class IntegralConfig:
-    """What is asked for, and how hard it is pursued."""
+    """Config of the signal `light` and of its controller."""
 
-    kind: str = setting("integral", "which law of the light")
+    kind: str = setting("integral", "controller of the light")
     setpoint: float = setting(1500.0, "light to hold", "counts", within=(0, 20_000))
-    gain: float = setting(0.003, "colder per count that is missing", "degC", within=(0, 1))
-    integral: float = setting(1e-5, "the same per count and sample", "degC", within=(0, 1))
+    gain: float = setting(0.003, "fall of the temperature per missing count", "degC", within=(0, 1))
+    integral: float = setting(1e-5, "further fall per missing count at each sample", "degC", within=(0, 1))
     memory: float = setting(5.0, "readings over which the light is averaged", "readings", at_least=1.0)
-    far: float = setting(100.0, "light farther than this from its setpoint is told", "counts", above=0.0)
+    far: float = setting(100.0, "distance from the setpoint above which the run reports it", "counts", above=0.0)
 
     def __post_init__(self) -> None:
         check(self, "signals.light")
 
 
 class Integral:
-    """T = 33 - gain e - I with e = setpoint - light, I <- I + integral e."""
+    """Controller T = 33 - gain e - I, degC, with e = setpoint - light and I <- I + integral e."""
 
     remembers = ("integral",)
 
@@ -50,7 +50,7 @@ class Integral:
 
 
 class Light:
-    """The light, averaged over some readings. See `Signal`."""
+    """Signal: light averaged over some readings. `Signal` describes the members."""
 
     name, actuator, columns = "light", THERMOSTAT.name, ("light", "light_setpoint")
     remembers, sees_light = ("law", "mean"), True
@@ -82,4 +82,4 @@ class Light:
 
 
 signals.add("light", Light)
-registry.add("integral", IntegralConfig, Integral, "Proportional and integral, on the light itself.", signal="light")
+registry.add("integral", IntegralConfig, Integral, "Proportional-integral controller of the light.", signal="light")

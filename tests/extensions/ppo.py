@@ -1,4 +1,4 @@
-"""An agent of one's own: proximal policy optimization (Schulman 2017) with an actor and a critic."""
+"""Example of an agent: proximal policy optimization (Schulman 2017) with an actor and a critic."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ from experiments.training.tasks import Task
 
 @dataclass(frozen=True)
 class PpoConfig:
-    """What shapes learning. Raises: ValueError naming key, value and allowed range."""
+    """Hyper-parameters of the agent. Raises: ValueError with key, value and allowed range."""
 
-    kind: str = setting("ppo", "which algorithm")
-    hidden: tuple[int, ...] = setting((32, 32), "of actor and critic", "units", at_least=1, some=True)
+    kind: str = setting("ppo", "kind of agent")
+    hidden: tuple[int, ...] = setting((32, 32), "hidden layers of actor and critic", "units", at_least=1, some=True)
     gamma: float = setting(0.95, "discount per step", at_least=0.0, below=1.0)
     trace: float = setting(0.9, "lambda of the advantages", within=(0, 1))
-    learning_rate: float = setting(3e-3, "Adam's", above=0.0, at_most=1.0)
+    learning_rate: float = setting(3e-3, "learning rate of Adam", above=0.0, at_most=1.0)
     total_steps: int = setting(20_000, "length of training", "steps", at_least=1)
-    horizon: int = setting(200, "between updates", "steps", at_least=2)
+    horizon: int = setting(200, "steps between updates", "steps", at_least=2)
     epochs: int = setting(10, "gradient steps on each horizon", at_least=1)
-    clip: float = setting(0.2, "how far a probability may change in one update", above=0.0, below=1.0)
+    clip: float = setting(0.2, "largest relative change of a probability in one update", above=0.0, below=1.0)
     entropy: float = setting(3e-3, "weight of the policy's entropy", at_least=0.0)
 
     def __post_init__(self) -> None:
@@ -37,7 +37,7 @@ class PpoConfig:
 
 
 class Ppo:
-    """S agents; the actor's outputs are logits, whose largest is the greedy action."""
+    """S agents. The actor's outputs are logits; the greedy action has the largest logit."""
 
     def __init__(self, config: PpoConfig, task: Task, streams: Streams, device: str) -> None:
         self.config, self.device = config, torch.device(device)
@@ -50,7 +50,7 @@ class Ppo:
         self._adams = [Adam(one.flat, one.grad) for one in (self.network, self._critic)]
         self._explore = UniformStream(streams["explore"], 1)
         self._kept: list[tuple[torch.Tensor, ...]] = []  # of this horizon: s, a, r, s', continues, ended
-        self._loss = torch.zeros(self.n_agents)  # of the critic
+        self._loss = torch.zeros(self.n_agents)  # loss of the critic
 
     def _weights(self, seeds: Any, sizes: tuple[int, ...]) -> torch.Tensor:
         flat = np.stack([initial_weights(sizes, seed, zero_output=True) for seed in seeds])
@@ -71,7 +71,7 @@ class Ppo:
             self._kept = []
 
     def _learn(self, s: Any, a: Any, r: Any, s_t: Any, continues: Any, ended: Any) -> None:
-        """Update on one horizon, each (S, T, ...): generalized advantages, then `epochs` steps on the clipped ratio."""
+        """Learn from one horizon, (S, T, ...) each: generalized advantages, then `epochs` steps on clipped ratios."""
         c = self.config
         v, v_t = (self._critic(seen).squeeze(-1) for seen in (s, s_t))
         advantage = r + c.gamma * continues * v_t - v

@@ -152,7 +152,7 @@ def test_another_pump_that_ran_is_not_counted_unless_it_is_asked_for(read: Read)
     both = read(chibio(pump_1_rate=U, pump_2_rate=4 * U, pump_3_rate=0.5 * U), pumps=(1, 3))
     np.testing.assert_allclose(both.pump_rate, 1.5 * U)
     assert both.notes == ()
-    with pytest.raises(RecordingError, match=r"pumps = \[5\]: allowed is a selection of 1, 2, 3, 4"):
+    with pytest.raises(RecordingError, match=r"pumps = \[5\]: allowed one or more of 1, 2, 3, 4"):
         read(chibio(), pumps=(5,))
 
 
@@ -197,9 +197,9 @@ def test_only_the_asked_rows_are_judged(read: Read) -> None:
     assert asked.row.tolist() == list(range(35))
     one = read(tidy(u=changed(U, 25, -0.02)))
     assert one.row.tolist() == [i for i in range(40) if i != 25]
-    assert one.notes == ("row 25: pump runs backwards: dropped, the rate before it is taken to go on",)
-    for rows, said in (((38, 60), "38:60: 2 rows lie"), ((35, None), "35:: 5 rows lie"), ((0, 5), "0:5: 5 rows lie")):
-        with pytest.raises(RecordingError, match=f"rows = {said} there; the file has rows 0:40"):
+    assert one.notes == ("row 25: pump ran backwards: dropped; the rate before is assumed to continue",)
+    for rows, said in (((38, 60), "38:60: selects 2"), ((35, None), "35:: selects 5"), ((0, 5), "0:5: selects 5")):
+        with pytest.raises(RecordingError, match=f"rows = {said} rows; the file has rows 0:40"):
             read(tidy(), rows=rows)
 
 
@@ -235,11 +235,11 @@ def test_one_reactor_of_several_is_taken_by_its_name_and_a_row_cut_off_before_it
     np.testing.assert_allclose(read(content, reactor="M1").od, OD + 0.1)
     first = read(content)
     np.testing.assert_allclose(first.od, OD)
-    assert first.notes == ("reactor M0 taken; the file also holds M1",)
+    assert first.notes == ("reactor M0 used; the file also has M1",)
     cut = read(content.replace(lines[5], lines[5].rsplit(",", 2)[0]), reactor="M1")
     assert cut.row.tolist() == [i for i in range(1, 80, 2) if i != 5]
-    assert cut.notes[:2] == ("reactor M1 taken; the file also holds M0", "row 5: fewer than 4 columns: dropped")
-    with pytest.raises(RecordingError, match="reactor = M5: allowed is one of M0, M1, which the file holds"):
+    assert cut.notes[:2] == ("reactor M1 used; the file also has M0", "row 5: fewer than 4 columns: dropped")
+    with pytest.raises(RecordingError, match="reactor = M5: allowed one of M0, M1, the reactors in the file"):
         read(content, reactor="M5")
 
 
@@ -260,7 +260,7 @@ def test_one_reactor_of_several_is_taken_by_its_name_and_a_row_cut_off_before_it
         pytest.param(tidy(u=changed(U, 8, np.nan)), [], [8], "row 8: ", id="pump-nan"),
         pytest.param(tidy().replace("\n8.0,", "\n8.0;"), [], [8], "row 8: fewer than 3 columns", id="short-row"),
         pytest.param(
-            tidy() + "40.0,0.2,0.0", [], [], "line 42: has no line end, so it may be torn: dropped", id="torn"
+            tidy() + "40.0,0.2,0.0", [], [], "line 42: has no line end, so it may be incomplete: dropped", id="torn"
         ),
         pytest.param(tidy(changed(OD, [7, 9], [-0.02, -0.3])), [9], [], "row 9: ", id="noise-of-a-sensor"),
     ],
@@ -281,7 +281,7 @@ def test_unusable_readings_are_missing_unusable_rows_dropped_and_both_reported(
     [
         pytest.param("", "is empty", id="empty"),
         pytest.param(" \n\n", "is empty", id="blank"),
-        pytest.param("# only a comment\n", "holds no data", id="comment"),
+        pytest.param("# only a comment\n", "has no data", id="comment"),
         pytest.param(",".join(COLUMNS) + "\n", "no complete data row", id="header-only"),
         pytest.param(b"\x7fELF\x02\x01\x00\x00", "not a text file", id="binary"),
         pytest.param(np.random.default_rng(0).bytes(4000), "not a text file", id="random-bytes"),
@@ -393,7 +393,7 @@ def test_one_recording_in_many_clothes(read: Read, content: str | bytes, note: s
 
 
 def test_a_time_without_unit_is_refused(read: Read) -> None:
-    with pytest.raises(RecordingError, match="column time holds 0 to 118, neither dates nor .*time_min, time_s or"):
+    with pytest.raises(RecordingError, match="column time has 0 to 118, neither dates nor .*time_min, time_s or"):
         read(known(header="time,od,pump_rate"))
 
 
@@ -445,15 +445,15 @@ def test_what_was_read_and_noted_stands_beside_a_refusal(read: Read) -> None:
 @pytest.mark.parametrize(
     ("rates", "names", "remedy"),
     [
-        pytest.param({1: 1.0, 3: 0.3}, "3", "say pumps=[1,3]", id="a-second-feed"),
-        pytest.param({1: 1.0, 2: 0.6}, "2", "say pumps=[1,2]", id="no-waste"),
-        pytest.param({1: 1.0, 2: 0.9}, "2", "say pumps=[1,2]", id="no-waste-in-the-flow-of-both"),
+        pytest.param({1: 1.0, 3: 0.3}, "3", "set pumps=[1,3]", id="a-second-feed"),
+        pytest.param({1: 1.0, 2: 0.6}, "2", "set pumps=[1,2]", id="no-waste"),
+        pytest.param({1: 1.0, 2: 0.9}, "2", "set pumps=[1,2]", id="no-waste-in-the-flow-of-both"),
         pytest.param({1: 1.0, 2: 1.1}, None, "", id="waste"),
         pytest.param({1: 1.0, 2: 4.0}, None, "", id="more-waste"),
-        pytest.param({3: 1.0}, "3", "say pumps=[3]", id="a-third"),
-        pytest.param({1: 1.0, 2: 1.4, 4: 0.3}, "4", "say pumps=[1,4]", id="waste-of-two-feeds"),
-        pytest.param({2: -1.1, 3: 1.0}, "3", "say pumps=[3]", id="another-feed-and-a-waste-written-backwards"),
-        pytest.param({2: 1.1}, "2", "say pumps=[2]", id="no-feed"),
+        pytest.param({3: 1.0}, "3", "set pumps=[3]", id="a-third"),
+        pytest.param({1: 1.0, 2: 1.4, 4: 0.3}, "4", "set pumps=[1,4]", id="waste-of-two-feeds"),
+        pytest.param({2: -1.1, 3: 1.0}, "3", "set pumps=[3]", id="another-feed-and-a-waste-written-backwards"),
+        pytest.param({2: 1.1}, "2", "set pumps=[2]", id="no-feed"),
         pytest.param({1: 1.0, 4: np.nan}, None, "", id="a-pump-that-is-not-there"),
     ],
 )
