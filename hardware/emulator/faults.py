@@ -64,9 +64,9 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
-    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; no effect without a second species"),
-    "fp_dead": ("plant", "0 or 1", "fluorescence reads 0; no effect without a second species"),
-    "fp_saturated": ("plant", "0 or 1", "fluorescence reads full scale; no effect without a second species"),
+    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; no effect if the culture emits no light"),
+    "fp_dead": ("plant", "0 or 1", "fluorescence reads 0; no effect if the culture emits no light"),
+    "fp_saturated": ("plant", "0 or 1", "fluorescence reads full scale; no effect if the culture emits no light"),
 }
 PLANT = {  # fault: part of the plant, its switch
     "pump_gain_factor": ("feed", "gain_factor"),
