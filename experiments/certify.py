@@ -40,7 +40,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
         config = replace(config, env=model_of(policy, config))
         found = certify(policy, config)
     log.info("%s: proven in %.1f s", source, time.perf_counter() - began)
-    for line in found.told():
+    for line in found.lines():
         log.info("%s", line)
     for line in found.cannot_hold():
         log.info("reported, not judged: %s", line)
@@ -86,7 +86,7 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
     files.write_json(folder / "summary.json", _summary(source, content, found))
     with closing(Events(folder)) as events:
         events.picture("figures/certificate", drawn, 0)
-        events.text("run/summary", "\n".join(f"- {line}" for line in found.told()))
+        events.text("run/summary", "\n".join(f"- {line}" for line in found.lines()))
     log.info(
         "certificate %s; report %s", folder / "certificate.json", page.save(page.of_runs(folder, [folder]), folder)
     )

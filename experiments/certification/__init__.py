@@ -1,4 +1,4 @@
-"""A certificate of a learned policy: the proven band that its closed loop enters and never leaves, for every setpoint.
+"""Certificate of a learned policy: for every setpoint a band is proven that the closed loop enters and never leaves.
 
-Numerics are pure: polygons of a network, images of intervals, a verdict. No proof depends on samples.
-"""
+All modules but `certificate` and `figure` are pure numerics: polygons of a network, images of intervals, proofs. No
+proof depends on samples."""

@@ -1,4 +1,4 @@
-"""The file of a certificate: its content, its place, and the conclusions of a device."""
+"""File of a certificate: its content and path, and the decision of a device whether to run the policy."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -24,22 +24,22 @@ BETTER = "train with another seed or n_agents=8, or use policy=shipped"
 
 
 class FormatError(ValueError):
-    """A certificate of another version of this program."""
+    """Error for a certificate that another version of this program wrote."""
 
 
 def beside(policy: Path) -> Path:
-    """Return the path of a policy file's certificate: certificate.json for policy.npz, else NAME.certificate.json."""
+    """Return the path of a policy's certificate: certificate.json for policy.npz, else NAME.certificate.json."""
     return policy.with_name("certificate.json" if policy.stem == "policy" else f"{policy.stem}.certificate.json")
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A certificate as read: its policy, its question, and its failures.
+    """Certificate as read from its file.
 
-    of: by name, fingerprints of the parts of a policy, and the other settings that affect the loop.
-    safe: every requirement of safety is met. passed: every requirement is met. failed: the requirements that are not.
-    setpoints: lowest and highest that it covers, OD. bounds: of an estimator's errors, and its growth shares.
-    cannot_hold: cases and setpoints that are not judged, because no pump rate of the policy holds the culture.
+    of: fingerprints of the policy's parts, and other settings that affect the loop, by name. safe: whether all safety
+    requirements are met. passed: whether all requirements are met. failed: the requirements that are not met.
+    config: settings of the proof. setpoints: lowest and highest certified setpoint, OD. bounds: on the estimator's
+    errors. cannot_hold: cases and setpoints that are not judged, because no pump rate holds the culture.
     """
 
     of: Mapping[str, Any]
@@ -52,7 +52,7 @@ class Stored:
     cannot_hold: tuple[str, ...]
 
     def differs(self, policy: Policy, settings: Mapping[str, Any]) -> list[str]:
-        """List every part of a policy and every setting that differs from the certified one."""
+        """List the parts of the policy and the settings that differ from the certified ones."""
         parts, given = fingerprints(policy), {**fingerprints(policy), **settings}
         names = [name for name in sorted({*given, *self.of}) if given.get(name) != self.of.get(name)]
         shown = {name: f"{name} = {given.get(name)}, certified {self.of.get(name)}" for name in names}
@@ -60,7 +60,7 @@ class Stored:
 
 
 def _up(value: Array, digits: float = 1e6) -> Array:
-    """Round up, so that the written number is still a bound."""
+    """Round up, so that the rounded number is still an upper bound."""
     return np.asarray(np.ceil(value * digits) / digits)
 
 
@@ -78,14 +78,14 @@ def _case(proof: Proof) -> dict[str, Any]:
 
 
 def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, found: Certificate) -> dict[str, Any]:
-    """Build the content of a certificate's file.
+    """Return the content of a certificate's file.
 
-    `band` is in ln(x / r) of a policy that sees the OD, else in e. `strips`: lowest and highest setpoint or growth
-    share, and the number of equal strips; columns have an entry per strip.
-    `cases`: those in the figure; `checks` have the worst of all others.
+    `band` is in ln(x / r) for a policy that sees the OD, else in e. `strips`: lowest and highest setpoint or growth
+    share, and the number of equal strips; the lists below have an entry per strip. `cases`: only those in the figure;
+    `checks` contain the worst value of every case.
 
-    Args: settings: other settings that affect the loop. config: with the nominal model in `env`, so that a reader can
-    repeat the proof.
+    Args: settings: other settings that affect the loop. config: settings of the proof, with the nominal model in `env`,
+    so that a reader can repeat the proof.
     """
     asked = found.question
     return {
@@ -107,7 +107,7 @@ def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, 
 
 
 def load(path: Path) -> Stored:
-    """Read a certificate. Raises: OSError; FormatError for one of another version; ValueError for a damaged one."""
+    """Read a certificate. Raises: OSError; FormatError for another version's file; ValueError for a damaged file."""
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
         if given["format"] != FORMAT:
@@ -129,7 +129,7 @@ def load(path: Path) -> Stored:
 
 
 def _check(given: Mapping[str, Any]) -> Requirement:
-    """Read a requirement; its value is null if it was not finite. Raises: ValueError, KeyError."""
+    """Read a requirement; the file has null for a value that was not finite. Raises: ValueError, KeyError."""
     name, where, kind = (str(given[key]) for key in ("name", "where", "kind"))
     if kind not in KINDS:
         raise ValueError(f"kind {kind} of a requirement: allowed {', '.join(KINDS)}")
@@ -139,10 +139,10 @@ def _check(given: Mapping[str, Any]) -> Requirement:
 
 
 def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
-    """Return the estimator's error bounds for which a policy may act; None without a certificate of safety.
+    """Return the bounds on the estimator's errors within which a policy may act; None if it is not certified as safe.
 
-    Args: settings: other settings that affect the loop. file: of the policy, beside its certificate. model: tau,
-    control period and largest pump rate of the run.
+    Args: settings: other settings that affect the loop. file: the policy file; its certificate is beside it. model:
+    tau, control period and largest pump rate of the run.
     """
     try:
         stored = load(beside(file))
@@ -155,10 +155,10 @@ def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvCo
 
 @dataclass(frozen=True)
 class Opinion:
-    """Conclusions of a device from a certificate.
+    """Decision of a device from a certificate.
 
-    refused: reasons to refuse the policy, each with its remedy. short: performance requirements that fail, each with
-    number, limit and remedy; no reason to refuse.
+    refused: reasons to refuse the policy, each with its remedy. short: warnings about performance requirements that
+    fail, with values, limits and remedy; they are no reason to refuse.
     """
 
     refused: list[str] = field(default_factory=list)
@@ -174,22 +174,22 @@ def judged(
     model: EnvConfig,
     name: str,
 ) -> Opinion:
-    """Judge a policy by its certificate: refuse for safety, report missing performance.
+    """Judge a policy by its certificate: refuse an unsafe policy, report missing performance.
 
-    It is proven again for the setpoints and the bench of the run; a different bench alone is no reason to refuse.
+    The policy is proven again for the run's setpoints and bench, so a different bench alone is no reason to refuse it.
 
-    Args: settings: other settings that affect the loop. file: of the policy, beside its certificate. setpoints: of the
-    run, OD. model: tau, control period and largest pump rate of the run. name: the user's name of the policy.
+    Args: settings: other settings that affect the loop. file: the policy file; its certificate is beside it. setpoints:
+    of the run, OD. model: tau, control period and largest pump rate of the run. name: value of `policy=`.
     """
     path, remedy = beside(file), f"python -m experiments.certify policy={name}"
     if name == "shipped":
-        remedy = "copy dqn/shipped/policy.npz and run that: python -m experiments.certify policy=COPY"
+        remedy = "copy dqn/shipped/policy.npz and certify the copy: python -m experiments.certify policy=COPY"
     try:
         stored = load(path)
     except FileNotFoundError:
-        return Opinion([f"it has no certificate; make one first: {remedy}"])
+        return Opinion([f"it has no certificate; create one first: {remedy}"])
     except FormatError as error:
-        return Opinion([f"its certificate {path} {error}; make a new one: {remedy}"])
+        return Opinion([f"its certificate {path} {error}; create a new one: {remedy}"])
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         return Opinion([f"its certificate {path} is damaged ({why}; {remedy})"])
@@ -200,43 +200,42 @@ def judged(
     try:
         again = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
     except CertificationError as error:
-        return Opinion([f"its certificate {path} asks for something else: {error} ({remedy})"])
+        return Opinion([f"its certificate {path} cannot be repeated for this run: {error} ({remedy})"])
     told = _short((*again, *stored.failed), stored)
     if unsafe := [check for check in again if check.kind == SAFETY]:
         what = _listed(unsafe)
-        other = "choose another bench or scenario, or train for this one"
-        return Opinion([f"certified again for this bench and scenario, it is not safe: {what} ({other})"], told)
+        other = "choose another bench or scenario, or train a policy for this one"
+        return Opinion([f"a proof for this bench and scenario shows that it is not safe: {what} ({other})"], told)
     return Opinion([], told)
 
 
 def _unfit(
     stored: Stored, policy: Policy, settings: Mapping[str, Any], path: Path, setpoints: Sequence[float], remedy: str
 ) -> str:
-    """Return why a certificate does not allow this policy at these setpoints, with the remedy; "" where it does."""
+    """Return why a certificate does not allow this policy at these setpoints, with the remedy; "" if it does."""
     if different := stored.differs(policy, settings):
-        return f"its certificate {path} is for another: {'; '.join(different)} (put it back, or {remedy})"
+        return f"its certificate {path} is for another policy: {'; '.join(different)} (restore it, or {remedy})"
     if not stored.safe:
-        what = _listed([check for check in stored.failed if check.kind == SAFETY]) or "it has no reason"
-        return f"by its certificate it is not safe: {what} ({BETTER}, then {remedy})"
+        what = _listed([check for check in stored.failed if check.kind == SAFETY]) or "no reason given"
+        return f"according to its certificate it is not safe: {what} ({BETTER}, then {remedy})"
     if laxer := stored.config.laxer():
         return f"its certificate is less strict than required: {'; '.join(laxer)} ({remedy})"
     if stored.config.quick and stored.bounds is not None:
-        return f"its certificate is a quick one, without errors of the gain ({remedy})"
+        return f"its certificate was made with quick=true, without errors of the gain ({remedy})"
     low, high = stored.setpoints
     outside = sorted({r for r in setpoints if not low - 1e-9 <= r <= high + 1e-9})
     if outside:
         asked = ", ".join(f"{r:g}" for r in outside)
         more = f"{remedy} 'setpoints=[LOW,HIGH]'"
-        return f"it is certified for setpoints {low:g} to {high:g}, the scenario asks for {asked} ({more})"
+        return f"it is certified for setpoints {low:g} to {high:g}, but the scenario has {asked} ({more})"
     return ""
 
 
 def _other_model(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> str:
-    """Return why a policy of the OD does not suit the culture or the pump of a run, with the remedy; "" where it does.
+    """Return why a policy of the OD does not suit the culture or the pump of a run, with the remedy; "" if it does.
 
-    It is proven for a tau and, so that nobody proves it for an easier culture, for a mu within `uncertainty` of its
-    training's; a policy of relative coordinates for any.
-    """
+    The tau of the run must be within `uncertainty` of the proven tau, and the proven mu within `uncertainty` of the
+    trained mu, so that no proof is for an easier culture. A policy in relative coordinates suits every tau and mu."""
     if policy.observation == RELATIVE:
         return ""
     proven, share = model_of(policy, config), 100.0 * config.uncertainty
@@ -247,31 +246,31 @@ def _other_model(policy: Policy, config: CertifyConfig, bench: Bench, model: Env
     tau = proven.tau * bench.tau / config.bench.tau
     if abs(model.tau / tau - 1.0) <= config.uncertainty:
         return ""
-    remedy = "give env_file=CALIBRATED.yaml of the calibration that it was trained on, or train for this pump"
-    return f"it is proven for tau = {tau:.3g} +- {share:.0f} %, this run has tau = {model.tau:.3g} ({remedy})"
+    remedy = "set env_file=CALIBRATED.yaml to the calibration used for its training, or train for this pump"
+    return f"it is proven for tau = {tau:.3g} +- {share:.0f} %, but this run has tau = {model.tau:.3g} ({remedy})"
 
 
 def _listed(checks: Sequence[Requirement]) -> str:
-    """Return the worst of each requirement, and how many there are in all."""
+    """Return the worst case of each requirement, and the number of all cases, as text."""
     told = "; ".join(map(str, worst(checks)))
     return told if len(checks) < 2 else f"{told} ({len(checks)} in all)"
 
 
 def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
-    """Return missing performance, wider limits of performance than the default, and cases that are not proven."""
+    """Return warnings: failed performance requirements, limits wider than the default, cases that are not proven."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
     if laxer := stored.config.laxer_limits(safety=False):
-        lines.append(f"its certificate sets wider limits of performance: {'; '.join(laxer)}")
+        lines.append(f"its certificate uses wider performance limits: {'; '.join(laxer)}")
     if stored.bounds is None:  # docs/certificate.md has the growth shares that the pump holds for other policies
         lines += [f"not proven: {case}; use a faster pump or less volume" for case in stored.cannot_hold]
     return lines
 
 
 def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:
-    """Adapt the question of a certificate to the bench of a run.
+    """Return the settings of a proof for the bench of a run.
 
-    For a policy of (error, growth share) B changes; for a policy of the OD the volume of the nominal model.
+    For a policy of (error, growth share), B changes; for a policy of the OD, the volume of the nominal model changes.
     """
     if policy.observation == RELATIVE:
         return replace(config, bench=bench, env=model, full_pumps=())

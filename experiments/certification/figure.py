@@ -1,4 +1,4 @@
-"""The figure of a certificate: bands, entry times, low doses, and the underlying polygons."""
+"""Figure of a certificate: polygons of the policy, bands, entry times, and doses below the setpoint."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ def figure(found: Certificate) -> Figure:
         entries.plot(middle, shown * (proof.later if asked.late else proof.entry), color=colour, linewidth=1.3)
     widths.set(xlabel=asked.what, ylabel=f"half-width, {asked.unit}", ylim=(0.0, None))
     widths.set_title("Band that the loop enters and never leaves (dotted: the one-line controller)")
-    if np.isfinite(widths.dataLim.intervaly).all():  # else neither the policy nor the one-line controller has a band
+    if np.isfinite(widths.dataLim.intervaly).all():  # else there is no band to draw
         widths.set(yscale="log", ylim=(0.7 * widths.dataLim.y0, 8.0 * widths.dataLim.y1))
     widths.legend(ncols=2, fontsize=7, loc="upper right")
     what = "periods after the one-line controller" if asked.late else "entry time over the pump's own"

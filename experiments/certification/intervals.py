@@ -1,7 +1,7 @@
-"""Sets of states as intervals: where each action may be chosen, and their image after a control period.
+"""Intervals of states: the states at which each action may be chosen, and the image of states after a control period.
 
-The state is one number d per strip of setpoints, and an action only shifts it: d' = d + shift(action). The image of an
-interval is an interval, for any number of possible actions.
+The state is one number d per strip of setpoints, and an action shifts it: d' = d + shift(action). If several actions
+are possible, the interval around all their images is used.
 """
 
 from collections.abc import Callable
@@ -16,17 +16,17 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 States = Callable[[Array, Array], tuple[Array, Array]]
 
-OUTWARD = 1e-12  # every image is wider by this, which is more than the rounding error
-ENTERED = 1e-9  # tolerance of being inside a limit
+OUTWARD = 1e-12  # each image is enlarged by this on both sides, more than the rounding error
+ENTERED = 1e-9  # a state this close to the limit of the images counts as inside
 MAX_IMAGES = 10_000
 SAME = 1e-12  # corners closer than this are merged
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Intervals of states in which an action may be chosen, P per strip; an empty one has low > high.
+    """Intervals of states, P per strip, each with an action that may be chosen there; low > high: empty.
 
-    low, high: (N, P). action: (N, P).
+    low, high: ends of the intervals, (N, P). action: index of the action, (N, P).
     """
 
     low: Array
@@ -35,7 +35,7 @@ class Pieces:
 
     @classmethod
     def of(cls, strip: Index, action: Index, low: Array, high: Array, strips: int) -> "Pieces":
-        """Build from one list of intervals, each with its strip."""
+        """Build from a flat list of intervals: strip, action and ends of each."""
         order = np.argsort(strip, kind="stable")
         row = strip[order]
         column = np.arange(row.size) - np.searchsorted(row, row)
@@ -46,7 +46,7 @@ class Pieces:
         return made
 
     def lowest(self, action: int) -> Array:
-        """Find the lowest state in which this action or a higher one may be chosen, (N,); inf where none is."""
+        """Return the lowest state in which `action` or a higher action may be chosen, (N,); inf if there is none."""
         return np.asarray(np.where(self.action >= action, self.low, np.inf).min(axis=1))
 
 
@@ -54,9 +54,9 @@ class Pieces:
 class Band:
     """Band that the closed loop enters and never leaves, for each strip, (N,).
 
-    invariant: the image of the start lies inside it. low, high: of the limit of images; nan without one.
-    path: the images, from the start to the last, (K + 1, N, 2); taken: periods from one to the next, (K, N), in which
-    the ends move evenly.
+    invariant: whether the first image of the start interval lies inside it. low, high: ends of the band, the limit of
+    the images; nan if not invariant. path: start interval and images, (K + 1, N, 2). taken: periods from each to the
+    next, (K, N); the ends move by equal steps in these periods.
     """
 
     invariant: Mask
@@ -66,7 +66,7 @@ class Band:
     taken: Index
 
     def until(self, low: Array, high: Array) -> Array:
-        """Return the periods until the state lies in [low, high] from any start, (N,); inf if not proven."""
+        """Return the periods until the state is in [low, high] from every start, (N,); inf if this is not proven."""
         beyond = np.stack([low - self.path[..., 0], self.path[..., 1] - high], axis=2)
         moved = beyond[:-1] - beyond[1:]
         share = np.divide(beyond[:-1], moved, out=np.sign(beyond[:-1]), where=moved > 0.0)
@@ -75,21 +75,22 @@ class Band:
 
     @property
     def entered(self) -> Mask:
-        """Return whether the images of the start reach the band, (N,); False without a band."""
+        """Whether the images of the start interval reach the band, (N,); False without a band."""
         return np.isfinite(self.until(self.low - ENTERED, self.high + ENTERED))
 
     @property
     def periods(self) -> Array:
-        """Return the periods until the state is inside from any start, (N,)."""
+        """Periods until the state is in the last image from every start, (N,)."""
         return self.until(*(self.path[-1] + ENTERED * np.array([-1.0, 1.0])).T)
 
 
 def images(pieces: Pieces, shift: Array, start: Array) -> Band:
-    """Iterate F^k(start) to its limit, F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
+    """Iterate I -> F(I) from the start interval to the limit.
 
-    F is monotonic: F(I) is in F(J) for I in J. So if F(start) is in the start, the F^k(start) are nested, no state
-    leaves them, and k periods are enough to reach F^k(start). Far out, where an end of the interval meets only
-    unbounded pieces, that end moves by the same step each period, and many periods are taken at once.
+    F(I) is the smallest interval that contains, for every piece, the part of I in this piece shifted by its action. F
+    is monotonic: if I is in J, F(I) is in F(J). So if F(start) is in the start interval, the images F^k(start) are
+    nested, no state leaves them, and every state is in F^k(start) after k periods. An end of the interval that lies in
+    unbounded pieces only moves by the same step each period; many such periods are taken at once.
 
     Args: shift: [low, high] that an action adds to the state, (N, A, 2). start: [low, high], (N, 2).
     """
@@ -113,7 +114,7 @@ def images(pieces: Pieces, shift: Array, start: Array) -> Band:
             axis=1,
         )
         inside = (image[:, 0] >= now[:, 0]) & (image[:, 1] <= now[:, 1])
-        invariant[active] &= inside  # by induction only the first image can be outside
+        invariant[active] &= inside  # only the first image can be outside
         moved = np.abs(image - now) > ENTERED
         step, reach = outer[active].transpose(1, 0, 2)
         ahead = image * np.array([-1.0, 1.0]) - reach  # periods in which an end moves by the same step
@@ -132,9 +133,9 @@ def images(pieces: Pieces, shift: Array, start: Array) -> Band:
 
 
 def _outer(low: Array, high: Array, shift: Array) -> Array:
-    """Return the motion of the upper end far out: [step, the least end from which only that step applies], (N, 2).
+    """Return, for the upper end in unbounded pieces, [its step per period, the lowest end with this step], (N, 2).
 
-    Args: low, high: of the pieces; shift: their largest shift; (N, P) each.
+    Args: low, high: ends of the pieces; shift: largest shift of their actions; each (N, P).
     """
     endless = np.isposinf(high) & (low <= high)
     step = np.where(endless.any(axis=1), np.where(endless, shift, -np.inf).max(axis=1), 0.0)
@@ -154,7 +155,7 @@ def _spread(first: Index, last: Index) -> tuple[Index, Index]:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of polygons, each with its polygon and its strip or line; all of shape (K,)."""
+    """K points of polygons: index of the polygon, index of the strip or line, and coordinates x and y, each (K,)."""
 
     polygon: Index
     strip: Index
@@ -162,10 +163,10 @@ class Points:
     y: Array
 
     def pieces(self, action: Index, states: States, strips: int) -> Pieces:
-        """Find the states of each polygon in each strip: least and largest of `states` over its points.
+        """Return the interval of states of each polygon in each strip, from the smallest to the largest of its points.
 
-        Args: action: of each polygon. states: (x, y) to [least, largest] state, each (K,); over a convex polygon both
-        have their extremes at corners. strips: their number.
+        Args: action: action of each polygon. states: function (x, y) -> (smallest, largest) possible state, each (K,);
+        over a convex polygon its extremes are at corners. strips: number of strips.
         """
         key = self.polygon * strips + self.strip
         order = np.argsort(key, kind="stable")
@@ -176,7 +177,7 @@ class Points:
 
 
 def crossings(regions: Regions, lines: Array) -> Points:
-    """Find where the edges of the polygons meet lines of constant second coordinate, given in rising order."""
+    """Return the points where edges of the polygons meet lines of constant second coordinate; `lines` must rise."""
     (x0, y0), (x1, y1) = np.moveaxis(regions.edges, (1, 2), (0, 1))
     first = np.searchsorted(lines, np.minimum(y0, y1), "left")
     edge, line = _spread(first, np.searchsorted(lines, np.maximum(y0, y1), "right"))
@@ -187,7 +188,7 @@ def crossings(regions: Regions, lines: Array) -> Points:
 
 
 def points_in_strips(regions: Regions, low: Array, high: Array) -> Points:
-    """Cut every polygon to every strip low <= y <= high, (S,) each and rising; return the corners."""
+    """Cut every polygon to every strip low <= y <= high and return the corners; low, high: rising, (S,)."""
     corner = regions.edges[:, 0]
     first = np.searchsorted(high, corner[:, 1], "left")
     k, strip = _spread(first, np.searchsorted(low, corner[:, 1], "right"))
@@ -197,10 +198,10 @@ def points_in_strips(regions: Regions, low: Array, high: Array) -> Points:
 
 
 def drops(regions: Regions) -> list[tuple[float, float, int, int]]:
-    """Find exactly where the action decreases as the first coordinate rises: (first, second coordinate, from, to).
+    """List where the action decreases as the first coordinate rises: (first, second coordinate, action, next action).
 
-    Between two neighbouring ordinates of corners every line of constant second coordinate meets the same polygons in
-    the same order, so one line is enough.
+    The search is exact: between two neighbouring second coordinates of corners, all lines of constant second coordinate
+    meet the same polygons in the same order, so one line is enough.
     """
     ordinates = np.unique(regions.edges[:, 0, 1])
     lines = ((ordinates[1:] + ordinates[:-1]) / 2.0)[np.diff(ordinates) > SAME]

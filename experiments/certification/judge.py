@@ -1,4 +1,4 @@
-"""The certificate of a policy: its proven properties and their limits."""
+"""Certification of a policy: its proven properties are compared with limits."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,16 +16,15 @@ from experiments.certification.verdict import Proof, attacked, dose_below, prove
 
 KINDS = SAFETY, PERFORMANCE = "safety", "performance"
 GRID = (256, 128)  # boxes of the cross-check
-ENOUGH = 100  # trajectories per strip that are enough to require the ends of a band
+ENOUGH = 100  # trajectories per strip from which on they must reach the ends of a band
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """One requirement: the worst value found, where, and the limit it must not exceed.
+    """Requirement: the worst value that was found must not exceed the limit.
 
-    kind: one of `KINDS`. A device refuses a policy that fails a safety requirement, and reports a failed performance
-    requirement.
-    """
+    name: "CASE: TITLE". where: strip with the worst value. kind: one of `KINDS`. A device refuses a policy that fails a
+    safety requirement; it only reports a failed performance requirement."""
 
     name: str
     value: float
@@ -35,12 +34,12 @@ class Requirement:
 
     @property
     def holds(self) -> bool:
-        """Return whether the requirement holds; not for nan."""
+        """Whether the value is within the limit; False for nan."""
         return self.value <= self.limit
 
     @property
     def title(self) -> str:
-        """The requirement without its case."""
+        """Name of the requirement without its case."""
         return self.name.split(": ", 1)[-1]
 
     def __str__(self) -> str:
@@ -49,7 +48,7 @@ class Requirement:
 
 
 def worst(checks: Iterable[Requirement]) -> list[Requirement]:
-    """Return for each title the check with the largest value relative to its limit; nan counts as largest."""
+    """Return for each title the requirement with the largest value relative to its limit; nan counts as largest."""
     found: dict[str, Requirement] = {}
     for check in checks:
         if check.title not in found or _beyond(check) > _beyond(found[check.title]):
@@ -64,12 +63,12 @@ def _beyond(check: Requirement) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What was found.
+    """Result of a certification.
 
-    doses: how far below the setpoint each of `levels` may be given, periods of growth, (3, S).
-    drops: where a higher reading gets a smaller dose, (first, second coordinate, from, to).
-    regions: exact polygons of the policy. quick: without gain errors.
-    """
+    question: what was to be proven. proofs: one per case. checks: all requirements. levels: three actions; doses:
+    largest distance below the setpoint at which each of them may be chosen, periods of growth, (3, S). drops: points
+    where a higher reading gets a smaller dose, see `intervals.drops`. regions: exact polygons of the policy. quick:
+    whether errors of the gain were omitted."""
 
     question: Question
     proofs: tuple[Proof, ...]
@@ -92,7 +91,7 @@ class Certificate:
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
-        """List the setpoints that no policy can hold, because pump or growth are too weak; one line per stretch."""
+        """List the ranges of setpoints or growth shares that no policy can hold, as pump or growth is too weak."""
         found: dict[tuple[float, float], list[str]] = {}
         for proof in self.proofs:
             for stretch in _runs(self.question.loop, ~proof.holdable):
@@ -104,8 +103,8 @@ class Certificate:
             for (low, high), names in found.items()
         ]
 
-    def told(self) -> list[str]:
-        """List every failed requirement, and for each title that is met the case closest to its limit."""
+    def lines(self) -> list[str]:
+        """List every failed requirement and, for each title, the fulfilled case that is closest to its limit."""
         titles: dict[str, list[Requirement]] = {}
         for check in self.checks:
             titles.setdefault(check.title, []).append(check)
@@ -127,7 +126,7 @@ def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, floa
 
 
 def certify(policy: Policy, config: CertifyConfig) -> Certificate:
-    """Certify a policy. Raises: CertificationError if the policy is of no known kind."""
+    """Certify a policy. Raises: CertificationError if a policy of this kind cannot be certified."""
     asked, network, levels = question(policy, config), Network.of(policy), (1, 2, _half(policy))
     exact, wider = partition(network, asked.box)
     proofs, doses = _proven(asked, wider, levels)
@@ -140,7 +139,7 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
 
 
 def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Requirement]:
-    """List the requirements that a policy fails at single setpoints; skip the search for trajectories out of a band."""
+    """List the requirements that a policy fails at single setpoints. Simulated trajectories are skipped."""
     asked = question(policy, config, setpoints)
     if policy.observation != RELATIVE:
         lines = np.clip(np.asarray(setpoints, dtype=np.float64), *asked.setpoints)
@@ -150,7 +149,7 @@ def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -
 
 
 def _proven(asked: Question, wider: Regions, levels: Sequence[int]) -> tuple[tuple[Proof, ...], Array]:
-    """Prove every case; return also how far below the setpoint each of some actions may be given, nominal, (L, S)."""
+    """Prove every case; also return, in the nominal case, `dose_below` of the actions `levels`, (L, S)."""
     met = [points_in_strips(wider, *asked.loop.seen(case)) for case in asked.cases]
     proofs = tuple(
         prove(asked.loop, points, wider.action, case, asked.margins[case.name])
@@ -160,13 +159,13 @@ def _proven(asked: Question, wider: Regions, levels: Sequence[int]) -> tuple[tup
 
 
 def _half(policy: Policy) -> int:
-    """Return the smallest action that gives at least half of the largest dose."""
+    """Return the index of the smallest action with at least half of the largest dose."""
     grid = actions(policy)
     return int(np.argmax(grid >= (0.5 - 1e-9) * grid[-1]))
 
 
 def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Requirement]:
-    """Attack every case: check whether a band is left, and whether it is wider than necessary."""
+    """Yield requirements by simulated worst-case trajectories: none leaves its band, all together fill the band."""
     once = {asked.loop.key(proof.case): proof for proof in reversed(proofs)} if trajectories else {}
     proofs = [proof for proof in proofs if proof in once.values()]
     found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs]
@@ -187,9 +186,10 @@ def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajector
 
 
 def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Requirement]:
-    """List every requirement with its worst strip. What the pump cannot hold fails only in the nominal model.
+    """Yield every requirement of the proofs with its worst strip.
 
-    dose: largest distance below the setpoint at which half of the largest dose is given, periods of growth, (S,).
+    A strip that the pump cannot hold fails in the nominal case; other cases ignore such strips.
+    Args: dose: largest distance below the setpoint at which half of the largest dose is given, periods of growth, (S,).
     """
     every = np.ones(dose.size, dtype=bool)
     yield _count("nominal: strips that the pump cannot hold", asked, ~proofs[0].holdable)
@@ -219,13 +219,13 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
 
 
 def _count(name: str, asked: Question, wrong: Mask) -> Requirement:
-    """Count strips that must not exist."""
+    """Return the requirement that no strip is `wrong`; its value is the number of wrong strips."""
     where = ", ".join(_place(asked, low, high) for low, high in _runs(asked.loop, wrong))
     return Requirement(name, float(wrong.sum()), 0.0, where)
 
 
 def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask, kind: str = SAFETY) -> Requirement:
-    """Take the largest value in some strips; nan (nothing could be proven) is the worst."""
+    """Return the requirement that the largest value of the strips `where` is within the limit; nan is the worst."""
     if not where.any():
         return Requirement(name, 0.0, limit, kind=kind)
     at = int(np.where(where, np.where(np.isnan(value), np.inf, value), -np.inf).argmax())

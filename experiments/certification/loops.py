@@ -1,8 +1,8 @@
-"""The closed loops that are proven: one number d per strip, which a period of growth and a dose shift.
+"""Closed loops that are proven. Their state is one number per strip; growth and dose of a period shift it.
 
-Of a policy that sees (OD, setpoint): d = ln(x / r), d' = d + h (mu - u / tau); a strip is of setpoints.
-Of a policy that sees (error, growth share): e' = e + s - v, with e = ln(x / r) / B, s = mu h / B, and v the dose as a
-fraction of the full pump; a strip is of growth shares. B is the decrease of ln x in one period at full pump rate.
+Policy that sees (OD, setpoint): the state is d = ln(x / r), d' = d + h (mu - u / tau). A strip is a range of setpoints.
+Policy that sees (error, growth share): the state is e = ln(x / r) / B, e' = e + s - v, with s = mu h / B and v the dose
+as a fraction of full pump. A strip is a range of growth shares. B is the decrease of ln x in one period of full pump.
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +14,14 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.certification.intervals import Pieces, States
 from experiments.certification.polygons import Array
 
-NEAR_ZERO = 1e-9  # fraction of a setpoint that represents an OD of zero
+NEAR_ZERO = 1e-9  # fraction of the setpoint that stands for an OD of zero
 
 
 @dataclass(frozen=True)
 class OdCase:
-    """Deviations from the nominal model.
+    """Allowed deviations from the nominal model.
 
-    Growth rate and pump constant lie within +- `share` of it, changing from period
-    to period, and a reading within +- `noise` OD of the culture.
+    share: relative deviation of mu and tau, +-, which may change in every period. noise: error of a reading, +-, OD.
     """
 
     name: str
@@ -32,10 +31,10 @@ class OdCase:
 
 @dataclass(frozen=True)
 class ShareCase:
-    """Bounds on the errors of e, s and the gain, at a setpoint if the bound of e depends on the OD.
+    """Bounds on the errors of e, s and the gain. setpoint: needed for a bound on e that depends on the OD.
 
-    slow: the estimate of the gain is wrong for a long time: v acts as requested, and the policy sees e in units of the
-    estimated B, as (1 +- gain) e. Otherwise each dose has an error of its own: v acts as v (1 +- gain).
+    slow: the estimate of the gain has a lasting error: v acts as requested, but the policy sees e in units of the wrong
+    B, as (1 +- gain) e. Otherwise each dose has a separate error: v acts as v (1 +- gain).
     """
 
     name: str
@@ -45,30 +44,31 @@ class ShareCase:
 
     @property
     def spread(self) -> float:
-        """Relative error of each dose."""
+        """Largest relative error of a single dose."""
         return 0.0 if self.slow else self.bounds.gain
 
     @property
     def scale(self) -> float:
-        """Relative error of the unit of e."""
+        """Largest relative error of the unit of e."""
         return self.bounds.gain if self.slow else 0.0
 
 
 class Loop(Protocol):
-    """A family of closed loops, one per strip; a case says what may disturb them.
+    """Interface of the closed loops, one per strip. A `case` defines the possible disturbances.
 
-    low, high: second coordinate of each strip, (S,). levels: what the actions give, rising from 0, (A,).
-    growth: least increase of the state in a period without a dose, (S,).
-    shift: [least, largest] change of the state by each action in a period, (S, A, 2).
-    range: the starts as states of each strip, (S, 2). seen: second coordinates that the policy may see in each strip.
-    states: [least, largest] state of what the policy sees; over a convex polygon extreme at its corners.
-    law: the one-line controller, by `_turns`: the least and the largest state, (S, A - 1), at which it goes on to the
-      next level, whose mean with the level before is `between`. key: cases of the same key have the same loop.
-    half_width: largest distance of a band of states from the setpoint, (S,), in OD or periods; `within`: its inverse,
-      at every setpoint of a strip; `in_od`: in OD, None without a setpoint.
-    attack: what the policy sees, (N, 2), and the change of the state for each action, (N, A). At push 1, of what is
-      seen and of the dynamics, (N, 2), it sees the lowest state and second coordinate, growth is fastest and a dose
-      weakest; at -1 the opposite; in between proportionally. second: [lowest, highest] of the strips, (N, 2).
+    low, high: range of the second coordinate of each strip, (S,). levels: doses of the actions, rising from 0, (A,).
+    growth: smallest increase of the state in a period without a dose, (S,).
+    shift: [smallest, largest] change of the state by each action in a period, (S, A, 2).
+    range: interval of possible starts in each strip, (S, 2). seen: range of second coordinates that the policy may see.
+    states: function of what the policy sees -> smallest and largest true state; over a convex polygon its extremes are
+      at corners. law: pieces of the one-line controller. _turns: smallest and largest state at which it changes from
+      one level to the next, (S, A - 1); between: means of neighbouring levels. key: equal for cases with equal loops.
+    half_width: largest distance of a band from the setpoint, (S,), in OD or periods. within: band of a half-width,
+      valid at every setpoint of a strip. in_od: a half-width in OD, None without a setpoint.
+    attack: what the policy sees, (N, 2), and the change of the state by each action, (N, A), under worst-case errors.
+      push: size of the errors of what is seen and of the dynamics, (N, 2). At 1 the policy sees the lowest state and
+      second coordinate, growth is fastest and doses are weakest; at -1 the opposite; else proportional. second:
+      [lowest, highest] of the strips, (N, 2).
     """
 
     low: Array
@@ -100,9 +100,9 @@ class Loop(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class OdLoop(Loop):
-    """Of (OD, setpoint).
+    """Closed loops of a policy that sees (OD, setpoint).
 
-    mu: 1/min. tau, control_min: min. levels: mL/s, (A,). start: OD from which the band is entered.
+    mu: 1/min. tau: u/tau is the dilution rate, 1/min. control_min: min. levels: mL/s, (A,). start: range of starts, OD.
     """
 
     mu: float
@@ -125,7 +125,7 @@ class OdLoop(Loop):
         return np.broadcast_to(change, (self.low.size, *change.shape))
 
     def _change(self, factor: Array | float) -> Array:
-        """Change of d: the smallest mu with the smallest tau dilutes most. Args: factor: of both."""
+        """Return the change of d if mu and tau are multiplied by `factor`; the smallest factor gives the smallest."""
         return np.asarray(self.control_min * (self.mu * factor - self.levels / (self.tau * factor)))
 
     def range(self, case: OdCase) -> Array:
@@ -157,16 +157,16 @@ class OdLoop(Loop):
 
 
 def _log(ratio: Array) -> Array:
-    """Return ln, -inf for an OD that is not above zero."""
+    """Return ln(ratio), -inf where ratio <= 0."""
     return np.log(ratio, out=np.full_like(ratio, -np.inf), where=ratio > 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ShareLoop(Loop):
-    """Of (error, growth share).
+    """Closed loops of a policy that sees (error, growth share).
 
-    levels: fractions of the full pump, to 1, (A,). start: range of OD from which the band is entered. setpoints: lowest
-    and highest. clip: ((e, s) lowest, (e, s) highest) that the policy sees; beyond, the nearest.
+    levels: fractions of full pump, from 0 to 1, (A,). start: range of starts, OD. setpoints: lowest and highest, OD.
+    clip: lowest (e, s) and highest (e, s) that the policy sees; others are clipped to these.
     """
 
     levels: Array
@@ -195,7 +195,7 @@ class ShareLoop(Loop):
         return low, high
 
     def _around(self, case: ShareCase, seen: Array) -> tuple[Array, Array]:
-        """Bound the true e of an estimate from below and above; both bounds rise with the estimate."""
+        """Return the smallest and the largest true e of each estimate; both rise with the estimate."""
         off = case.bounds.error_at(seen, case.setpoint)
         low, high = seen - off, seen + off
         least, most = 1.0 - case.scale, 1.0 + case.scale
@@ -205,7 +205,7 @@ class ShareLoop(Loop):
         (lowest, _), (highest, _) = self.clip
 
         def around(e: Array, s: Array) -> tuple[Array, Array]:
-            low, high = self._around(case, e)  # an estimate on the edge represents all beyond
+            low, high = self._around(case, e)  # an estimate on the edge stands for all estimates beyond it
             return np.where(e <= lowest, -np.inf, low), np.where(e >= highest, np.inf, high)
 
         return around
@@ -229,7 +229,7 @@ class ShareLoop(Loop):
     def in_od(self, case: ShareCase, half_width: float) -> float | None:
         if case.setpoint is None:
             return None
-        most = case.bounds.full_pump * (1.0 + case.scale)  # of B
+        most = case.bounds.full_pump * (1.0 + case.scale)  # largest B
         return float(case.setpoint * np.expm1(most * half_width))
 
     def attack(self, case: ShareCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""Exact convex polygons of the plane on which a policy prefers one action, and an independent check of them.
+"""Exact convex polygons on which a policy prefers one action, and an independent check of these polygons.
 
-A policy is a piecewise linear map of the plane, taken in double precision, with a bound for single precision.
-"""
+The Q values of a policy are piecewise linear functions on the plane of its two inputs. They are computed in double
+precision; a bound covers the errors of single precision."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from dqn.policy import Policy
 Array = NDArray[np.float64]
 
 UNIT = 2.0**-24  # relative rounding error of one operation in single precision
-SLACK = 1e-9  # of a Q value; exceeds the rounding of the geometry in double precision
-FLAT = 1e-12  # a value this close to zero is on the line; far below `rounding`
+SLACK = 1e-9  # tolerance of a Q value; larger than the rounding errors of the geometry in double precision
+FLAT = 1e-12  # values this close to zero count as zero; far below `rounding`
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """q = W_L relu(... relu(W_1 (M z + c) + b_1)) + b_L of z in the plane.
+    """Network q = W_L relu(... relu(W_1 (M z + c) + b_1)) + b_L for points z of the plane.
 
-    weights (in, out) and biases (out,): the first pair is M^T and c and has no relu behind it. They are those of the
-    file, but each hidden unit is multiplied by a power of two, exactly, to a size near 1: `FLAT` is an absolute limit.
+    weights (in, out) and biases (out,): the first pair is M^T and c, without relu. The values are those of the file,
+    but each hidden unit is scaled by a power of two to a size near 1, which is exact: `FLAT` is an absolute limit.
     """
 
     weights: tuple[Array, ...]
@@ -52,19 +52,19 @@ class Network:
 
     @property
     def output(self) -> tuple[Array, Array]:
-        """The last layer, likewise."""
+        """Last layer, combined with the input map if there is no hidden layer."""
         if len(self.weights) == 2:
             return self.weights[0] @ self.weights[1], self.biases[0] @ self.weights[1] + self.biases[1]
         return self.weights[-1], self.biases[-1]
 
 
 def rounding(network: Network, points: Array) -> Array:
-    """Bound the error of Q in single precision at points (N, 2), shape (N, A).
+    """Return a bound on the error of Q in single precision at points (N, 2), shape (N, A).
 
-    A sum of n products in any order is off by at most g (|h| |W| + |b|), g = (n + 1) u / (1 - (n + 1) u), u = 2^-24
-    (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). relu enlarges no error; an inactive unit
-    passes only the part above zero. On a cell where the network is linear the bound is convex, so its largest value at
-    the corners bounds the inside.
+    The error of a sum of n products, in any order, is at most g (|h| |W| + |b|) with g = (n + 1) u / (1 - (n + 1) u),
+    u = 2^-24 (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). A relu does not increase errors;
+    an inactive unit passes only the part above zero. On a cell where the network is linear the bound is convex, so the
+    largest value at the corners holds in the whole cell.
     """
     h, error = points, UNIT * np.abs(points)
     last = len(network.weights) - 1
@@ -81,10 +81,10 @@ def rounding(network: Network, points: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Convex polygons with the action of each.
+    """P convex polygons, each with an action.
 
-    edges: from corner to corner, shape (E, 2, 2): [edge, end, coordinate]. owner: polygon of each edge, (E,).
-    action: of each polygon, (P,).
+    edges: edges of all polygons, shape (E, 2, 2): [edge, end, coordinate]. owner: polygon of each edge, (E,).
+    action: action of each polygon, (P,).
     """
 
     edges: Array
@@ -102,7 +102,7 @@ class Regions:
 
 
 def area(regions: Regions) -> Array:
-    """Area of each polygon, (P,): half the sum over its edges of x0 y1 - x1 y0, from its first corner."""
+    """Return the area of each polygon, (P,): half the sum over edges of x0 y1 - x1 y0, relative to the first corner."""
     first = np.unique(regions.owner, return_index=True)[1]
     (x0, y0), (x1, y1) = np.moveaxis(regions.edges - regions.edges[first, :1][regions.owner], (1, 2), (0, 1))
     return np.abs(np.bincount(regions.owner, x0 * y1 - x1 * y0)) / 2.0
@@ -111,7 +111,8 @@ def area(regions: Regions) -> Array:
 def _clip(rows: Array, value: Array) -> Array:
     """Cut a convex polygon to the part where a linear function is >= 0.
 
-    Args: rows: corners in order, with other linear values beside them, (V, C). value: of the function at them, (V,).
+    Args: rows: corners in order, each followed by values of other linear functions there, (V, C). value: values of the
+    function at the corners, (V,).
     """
     value = np.where(np.abs(value) <= FLAT, 0.0, value)
     after, following = np.roll(value, -1), np.roll(rows, -1, axis=0)
@@ -122,9 +123,9 @@ def _clip(rows: Array, value: Array) -> Array:
 
 
 def _cells(rows: Array, layers: list[tuple[Array, Array]]) -> Iterator[Array]:
-    """Split a polygon into cells on which all units keep their sign, with the last layer's inputs at their corners.
+    """Split a polygon into cells on which all units keep their sign; yield corners with the last layer's inputs there.
 
-    Args: rows: corners, followed by the inputs of the first of `layers` there, (V, 2 + n).
+    Args: rows: corners, each followed by the inputs of the first of `layers` there, (V, 2 + n).
     """
     if not layers:
         yield rows
@@ -143,9 +144,9 @@ def _cells(rows: Array, layers: list[tuple[Array, Array]]) -> Iterator[Array]:
 
 
 def _best(corners: Array, q: Array, slack: Array) -> Iterator[tuple[Array, int]]:
-    """Find where each action's Q is within the slack of every other's; a cell of linear Q splits into convex polygons.
+    """Yield, in a cell with linear Q, the convex polygon on which each action may be best, up to the slack.
 
-    Args: corners (V, 2); q: at them, (V, A). slack: of each action's Q, (A,).
+    Args: corners: (V, 2); q: Q at the corners, (V, A). slack: possible error of each action's Q, (A,).
     """
     lead = q[:, :, None] - q[:, None, :] + (slack[:, None] + slack[None, :])
     low, high = lead.min(axis=0), lead.max(axis=0)
@@ -161,10 +162,10 @@ def _best(corners: Array, q: Array, slack: Array) -> Iterator[tuple[Array, int]]
 
 
 def partition(network: Network, box: tuple[tuple[float, float], tuple[float, float]]) -> tuple[Regions, Regions]:
-    """Partition a rectangle of the plane by a policy, twice.
+    """Divide a rectangle of the plane into polygons of equal action, in two ways.
 
-    Returns: the exact polygons of the argmax, which tile the rectangle; and wider ones that contain every point at
-    which single precision may choose the action.
+    Returns: the exact polygons of the argmax, which tile the rectangle; and larger polygons, which contain every point
+    at which the action may be chosen in single precision.
     Args: box: ((low, high) of the first coordinate, (low, high) of the second).
     """
     (x0, x1), (y0, y1) = box
@@ -180,10 +181,10 @@ def partition(network: Network, box: tuple[tuple[float, float], tuple[float, flo
 
 
 def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Find the actions that may be best in boxes with corners low, high (N, 2); shape (N, A).
+    """Return which actions may be best anywhere in boxes with corners low, high (N, 2); shape (N, A).
 
-    Each unit is an affine form, centre + slopes . (offset in the box) +- rest: a zonotope of two generators and a box.
-    A relu that changes its sign on [l, u] becomes its chord's slope u / (u - l) with a rest of -l u / (2 (u - l)).
+    Each unit is bounded by an affine form, centre + slopes . (offset in the box) +- rest (a zonotope). A relu whose
+    input changes sign in [l, u] becomes a line of slope u / (u - l) with an error of up to -l u / (2 (u - l)).
     """
     centre, slopes, rest = (low + high) / 2.0, np.eye(2) * ((high - low) / 2.0)[:, None, :], np.zeros_like(low)
     for weight, bias in network.hidden:
@@ -203,9 +204,9 @@ def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
 
 
 def contradictions(network: Network, regions: Regions, grid: tuple[int, int]) -> int:
-    """Count corners of polygons whose action the bound of their box excludes, over a grid of boxes on all polygons.
+    """Count corners of polygons whose action is impossible by the bounds of their box, for a grid of boxes.
 
-    Gaps or overlaps of the polygons count as one more.
+    If the polygons do not tile the rectangle exactly, the count is one higher.
     """
     corner = regions.edges[:, 0]
     low, high = corner.min(axis=0), corner.max(axis=0)

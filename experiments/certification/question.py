@@ -1,4 +1,4 @@
-"""What to prove of a policy: closed loops, disturbances, limits."""
+"""Question of a certificate: closed loops to prove, their disturbances, limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from experiments.certification.config import CertifyConfig
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.polygons import Array
 
-BEYOND = 1e-6  # margin of the plane beyond the required range
+BEYOND = 1e-6  # margin around the required range
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
 
 
@@ -24,18 +24,18 @@ class CertificationError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is to be proven of a policy.
+    """Properties to prove of a policy.
 
-    loop: its closed loops. cases: what may disturb them; the first one is the nominal.
-    margins: case -> largest half-width beyond the one-line controller's. judged: case -> limit of safety of that
-    excess; a case that is not in it is not judged by its half-width.
-    late: case -> periods after that controller within which the state must be in its half-width plus the margin; a
-    case that is not in it is judged by the pump's own time. box: of the plane that the policy is shown.
-    reached: least fraction of the band that the attack must reach, with exact estimates and with errors; None: not
-    judged, because a policy of the OD may rest at several places of a strip, and their hull is its band.
-    unit: of half-widths. what: a strip is one of. setpoints: lowest and highest, OD.
-    drawn: cases that a figure shows. bounds: of an estimator, where the policy needs one.
-    median: limit of safety of the median excess over all strips of the nominal case; None: not judged.
+    loop: closed loops of the policy. cases: possible disturbances; the first case is the nominal.
+    margins: case -> limit of the excess, the half-width of the band beyond that of the one-line controller. judged:
+    case -> safety limit of the excess; cases without an entry have no limit of the half-width.
+    late: case -> periods after the one-line controller within which the state must be in the half-width of that
+    controller plus the margin; cases without an entry are compared with the pump's own time. box: range of the inputs
+    of the policy. reached: fraction of the band that trajectories must reach, with exact estimates and with errors;
+    None for a policy of the OD, whose band may contain gaps between several resting places.
+    unit: unit of half-widths. what: second coordinate, of which strips are ranges. setpoints: lowest and highest, OD.
+    drawn: cases in the figure. bounds: on the errors of the estimator, None without an estimator.
+    median: safety limit of the median excess over the strips of the nominal case; None: no limit.
     """
 
     loop: Any
@@ -54,7 +54,7 @@ class Question:
 
 
 def actions(policy: Policy) -> Array:
-    """Return the action grid, rising from 0. Raises: CertificationError for another one."""
+    """Return the action grid. Raises: CertificationError if it does not rise from 0."""
     grid = np.asarray(policy.actions, dtype=np.float64)
     if grid[0] != 0.0 or not (np.diff(grid) > 0.0).all():
         raise CertificationError("its actions do not rise from 0; train with the action grid of env")
@@ -62,10 +62,10 @@ def actions(policy: Policy) -> Array:
 
 
 def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
-    """Choose the nominal model: the one that is asked for, else the one the policy was trained on.
+    """Return the nominal model: `env` of the config, else the model of the policy's training.
 
-    A policy of (error, growth share) fits any model; the bench's model converts OD to e for bounds that depend on the
-    OD.
+    A policy of (error, growth share) fits every model. For it the default is the bench's model, which converts OD to e
+    for bounds that depend on the OD.
     Raises: CertificationError if the policy has no model or another control period.
     """
     if policy.observation not in (ABSOLUTE, RELATIVE):
@@ -78,12 +78,12 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
         return model or EnvConfig(tau=bench.tau, control_min=bench.control_min, max_pump_rate=bench.max_rate)
     if model is None:
         if not {"mu", "tau"} <= set(said):
-            raise CertificationError("it has no model of its training; give env.mu=MU env.tau=TAU")
+            raise CertificationError("its file has no model of the training; set env.mu=MU env.tau=TAU")
         model = build(EnvConfig(), {k: said[k] for k in MODEL if k in said})
     period = float(policy.metadata.get("control_min", model.control_min))
     if abs(period - model.control_min) > 1e-9:
         raise CertificationError(
-            f"it acts every {period:g} min, env.control_min = {model.control_min:g}; give env.control_min={period:g}"
+            f"it acts every {period:g} min, but env.control_min = {model.control_min:g}; set env.control_min={period:g}"
         )
     return model
 
@@ -103,9 +103,9 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))
     if not low < high:
-        raise CertificationError(f"setpoints {low:g} to {high:g}: allowed low < high; give setpoints=[LOW,HIGH]")
+        raise CertificationError(f"setpoints {low:g} to {high:g}: allowed low < high; set setpoints=[LOW,HIGH]")
     if not (np.isneginf(policy.low) & np.isposinf(policy.high)).all():
-        raise CertificationError("it clips OD or setpoint, which is not proven; export it without limits")
+        raise CertificationError("it clips OD or setpoint, which the proof does not cover; export it without limits")
     strips = _strips(low, high, config.strip)
     loop = OdLoop(model.mu, model.tau, model.control_min, actions(policy), config.start_od, *strips)
     cases = (
@@ -116,7 +116,7 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
     )
     margins = {case.name: limits.excess_uncertain for case in cases} | {"nominal": limits.excess}
     judged = {"nominal": limits.safe_excess, "noise and uncertain": limits.safe_excess_uncertain}
-    highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # of any setpoint that starts at a strip's d
+    highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # highest start over a strip
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
     return Question(
         loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins),
@@ -125,12 +125,12 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
-    """Build the question of a policy from (error, growth share) to a fraction of the largest dose."""
+    """Build the question of a policy that sees (error, growth share)."""
     model, limits, (low, high) = model_of(policy, config), config.limits, config.growth_shares
     clip = (np.asarray(policy.low, dtype=np.float64), np.asarray(policy.high, dtype=np.float64))
     if not clip[0][1] - BEYOND <= low < high <= clip[1][1] + BEYOND:
         raise CertificationError(
-            f"growth_shares = [{low:g}, {high:g}]: allowed {clip[0][1]:g} to {clip[1][1]:g}, which it was trained for"
+            f"growth_shares = [{low:g}, {high:g}]: allowed {clip[0][1]:g} to {clip[1][1]:g}, the range of the training"
         )
     full = full_pump(model)
     lowest, highest = config.setpoints or (min(model.setpoints), max(model.setpoints))
@@ -165,8 +165,8 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
 
 
 def question(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None = None) -> Question:
-    """Build the question for this kind of policy. Raises: CertificationError for another kind.
+    """Build the question for a policy. Raises: CertificationError if a policy of this kind cannot be certified.
 
-    Args: setpoints: of the cases whose errors depend on the OD; None: the lowest, the middle, the highest.
+    Args: setpoints: setpoints of the cases whose errors depend on the OD; None: lowest, middle and highest.
     """
     return _of_share(policy, config, setpoints) if policy.observation == RELATIVE else _of_od(policy, config)

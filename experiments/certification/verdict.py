@@ -1,4 +1,4 @@
-"""Proof of a closed loop's band, and attacks on it."""
+"""Proof of the band of a closed loop, and attacks: simulated worst-case trajectories that try to leave the band."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from experiments.certification.loops import Loop
 from experiments.certification.polygons import Array
 
 STILL = 1e-9  # smaller changes of the state in a period count as zero
-ATTACKED = 60  # periods of an attacking trajectory
-SETTLED = 20  # of them until the start has no influence
-LESS = (0.0, 0.3)  # probabilities of intermediate disturbances, for each half of the trajectories
-TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities of a change of side, for each quarter of the trajectories
+ATTACKED = 60  # periods of a worst-case trajectory
+SETTLED = 20  # periods after which the start has no influence any more
+LESS = (0.0, 0.3)  # probabilities of a smaller disturbance in a period; each trajectory has one of them
+TURNS = (0.5, 0.2, 0.05, 0.0)  # probabilities that the disturbance changes its sign; each trajectory has one of them
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """Proof of a policy under one case, for each strip, (S,).
+    """Proof of a policy in one case, for each strip, (S,).
 
-    holdable: without a dose the culture grows, with the full pump it is diluted, under any disturbance.
-    band, law: of the policy, and of the one-line controller. half_width, law_half_width: of the bands.
-    allowed: [lowest, highest] state of a half-width that exceeds the controller's by what is allowed, (S, 2).
-    entry: periods until the state is allowed, over those of the physics; inf: never.
-    grows: below the range of starts every possible dose lets it grow.
+    holdable: whether the culture always grows without a dose and always shrinks at full pump. band: band of the policy;
+    law: band of the one-line controller. half_width, law_half_width: half-widths of these bands.
+    allowed: [lowest, highest] allowed state: half-width of the one-line controller plus the margin, (S, 2).
+    entry: periods until the state is within `allowed`, over those of `physical`; inf: never.
+    grows: whether the culture grows under every possible dose while it is below the range of starts.
     """
 
     case: Any
@@ -41,20 +41,20 @@ class Proof:
 
     @property
     def excess(self) -> Array:
-        """Half-width beyond the one-line controller's, (S,)."""
+        """Half-width of the band minus that of the one-line controller, (S,)."""
         return self.half_width - self.law_half_width
 
     @property
     def later(self) -> Array:
-        """Periods after the one-line controller until within `allowed`, (S,); inf: never."""
+        """Periods until the state is within `allowed`, minus those of the one-line controller, (S,); inf: never."""
         of_policy, of_law = (band.until(*self.allowed.T) for band in (self.band, self.law))
         return of_policy - np.where(np.isfinite(of_law), of_law, 0.0)
 
 
 def physical(start: Array, shift: Array, goal: Array) -> Array:
-    """Return the periods from the ends of `start` into `goal`, at full pump or without, the slower one, (S,).
+    """Return the periods from `start` into `goal`: from above at full pump, from below without; the larger, (S,).
 
-    Args: start, goal: [lowest, highest] state, (S, 2). shift: [least, largest] of each action, (S, A, 2).
+    Args: start, goal: [lowest, highest] state, (S, 2). shift: [smallest, largest] shift by each action, (S, A, 2).
     """
     fall, rise = -shift[:, -1, 1], shift[:, 0, 0]
     with np.errstate(divide="ignore"):
@@ -65,8 +65,8 @@ def physical(start: Array, shift: Array, goal: Array) -> Array:
 def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 0.0) -> Proof:
     """Prove the band of every strip from the states in which each action may be chosen.
 
-    Args: points: of polygons in the strips that the policy sees (`loop.seen`); action: of each polygon. margin: allowed
-    half-width beyond the controller's.
+    Args: points: points of the polygons in the strips that the policy sees (`loop.seen`); action: action of each
+    polygon. margin: allowed half-width beyond that of the one-line controller.
     """
     pieces = points.pieces(action, loop.states(case), loop.low.size)
     shift, start = loop.shift(case), loop.range(case)
@@ -89,9 +89,9 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
 
 
 def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Sequence[int]) -> Array:
-    """Return how far below the setpoint each action or a higher one is chosen, periods of growth, (actions, S).
+    """Return the largest distance below the setpoint at which each action or a higher one may be chosen, (actions, S).
 
-    0 if it is only chosen above; limited to the range of starts.
+    The unit is periods of growth. The value is 0 for actions chosen only above the setpoint, and limited to the starts.
     """
     pieces = points.pieces(action, loop.states(case), loop.low.size)
     lowest = np.stack([pieces.lowest(a) for a in actions])
@@ -99,13 +99,13 @@ def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Se
 
 
 def attacked(policy: Policy, loop: Loop, proof: Proof, trajectories: int) -> tuple[int, Array]:
-    """Attack the proven band by trajectories of the policy itself, in single precision.
+    """Attack the proven bands: simulate worst-case trajectories of the policy itself, in single precision.
 
-    They start anywhere in the band of a strip. Every disturbance has its largest size, with a sign that changes at
-    random: often, to find the steps of the policy, or seldom, to move far. Sometimes it is intermediate, to reach the
-    states from which the ends are reached.
-    Returns: the number that left the band; the fraction of each strip's band reached after `SETTLED` periods, (S,), nan
-    without a band.
+    Each trajectory starts anywhere in the band of a strip. Each disturbance has its largest size. Its sign changes at
+    random: often, to find steps between actions, or rarely, to move far. Sometimes a disturbance is smaller, to reach
+    more states.
+    Returns: number of trajectories that left their band; fraction of each strip's band that was reached after
+    `SETTLED` periods, (S,), nan without a band.
     """
     rng = np.random.default_rng(0)
     proven = np.flatnonzero(proof.band.invariant & proof.holdable)

@@ -76,14 +76,14 @@ def refused(path: Path, folder: Path, **changes: Any) -> str:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "changed by one bit": (
-        {"given": nudged(laws.law()), "of": laws.law()}, r"certificate.json is for another: its weights \(put it",
+        {"given": nudged(laws.law()), "of": laws.law()}, r"certificate.json is for another policy: its weights",
     ),
     "not safe": ({"given": laws.law(gain=-laws.GAIN)}, r"strips without a band: 80, allowed 0 .*setpoint 0\.4 to 0\.8"),
     "said to be safe": (
         {"given": laws.low_corner(), "safe": True, "passed": True, "checks": []},
-        r"certified again .* washed out: 1, .*\(setpoint 0.45\)",
+        r"a proof for this bench .* washed out: 1, .*\(setpoint 0.45\)",
     ),
-    "elsewhere on both sides": ({"given": laws.law(), "setpoints": [0.5, 0.6]}, r"0.5 to 0.6, .* asks for 0.45, 0.65 "),
+    "elsewhere on both sides": ({"given": laws.law(), "setpoints": [0.5, 0.6]}, r"0.5 to 0.6, .* has 0.45, 0.65 "),
     "damaged": ({"given": laws.law(), "setpoints": None}, r"certificate.json is damaged \(TypeError"),
     "of an unknown kind": (
         {"given": laws.law(), "checks": [asdict(Requirement("a", 2.0, 1.0, kind="taste")) | {"holds": False}]},
@@ -100,7 +100,7 @@ def test_a_device_refuses_what_is_not_proven_and_says_how_to_prove_it(tmp_path, 
     said = refused(source, tmp_path / "run")
     assert re.search(why, said)
     assert "\n" not in said
-    assert "certified again" in said or f"python -m experiments.certify policy={source}" in said
+    assert "a proof for this bench" in said or f"python -m experiments.certify policy={source}" in said
 
 
 def concluded(given: policy.Policy, path: Path) -> certificate.Opinion:
@@ -195,7 +195,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(tmp_
     given = replace(laws.law(), metadata={**laws.law().metadata, "model": {**laws.MODEL, "mu": 0.0432}})
     written(source, given, config=grown)
     said = refused(source, tmp_path / "run", bench=weak)
-    assert "certified again" in said
+    assert "a proof for this bench" in said
     assert "the pump cannot hold: 2" in said
     check = policy_check(replace(wanted, bench=weak))
     assert (check.ok, check.required) == (False, True)
@@ -272,12 +272,12 @@ def beside(relative: Path, given: policy.Policy, folder: Path) -> Path:
 
 
 CHANGED: dict[str, tuple[dict[str, Any], str]] = {
-    "gate": ({"gate_sigma": 20.0}, "estimator.gate_sigma = 20.0, certified 5.0 (put it back"),
-    "whole number": ({"gate_max": 20}, "estimator.gate_max = 20, certified 6 (put it back"),
-    "switch": ({"told": False}, "estimator.told = False, certified True (put it back"),
+    "gate": ({"gate_sigma": 20.0}, "estimator.gate_sigma = 20.0, certified 5.0 (restore it"),
+    "whole number": ({"gate_max": 20}, "estimator.gate_max = 20, certified 6 (restore it"),
+    "switch": ({"told": False}, "estimator.told = False, certified True (restore it"),
     "two": (
         {"growth_cv": 0.0, "gate_od": 0.0},
-        "estimator.gate_od = 0.0, certified 0.025; estimator.growth_cv = 0.0, certified 0.05 (put it back",
+        "estimator.gate_od = 0.0, certified 0.025; estimator.growth_cv = 0.0, certified 0.05 (restore it",
     ),
 }
 
@@ -342,7 +342,7 @@ def test_another_supervisor_is_another_policy(relative, tmp_path, monkeypatch, m
     source = beside(relative, own, tmp_path)
     unpacked(source, tmp_path / "run")
     monkeypatch.setattr(module, name, value)
-    assert f"is for another: {said} (put" in refused(source, tmp_path / "run")
+    assert f"is for another policy: {said} (restore" in refused(source, tmp_path / "run")
 
 
 def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
@@ -402,7 +402,7 @@ def test_a_quick_certificate_is_refused_by_name(undrawn: None, tmp_path: Path) -
     words = "quick=true", "setpoints=[0.4,0.8]", f"to={tmp_path / 'certificate.json'}"
     certified(laws.share_law(), tmp_path, *words)
     assert certificate.load(tmp_path / "certificate.json").passed
-    assert "its certificate is a quick one" in refused(tmp_path / "policy.npz", tmp_path / "run")
+    assert "its certificate was made with quick=true" in refused(tmp_path / "policy.npz", tmp_path / "run")
     assert unpacked(tmp_path / "policy.npz", tmp_path / "forced", force_policy=True).bounds is None
     certified(laws.law(), tmp_path, *words)
     unpacked(tmp_path / "policy.npz", tmp_path / "run")
@@ -462,7 +462,7 @@ def test_what_cannot_be_certified_ends_in_one_line(tmp_path: Path) -> None:
     share = find_policy("shipped").with_name("coculture.npz")
     for asked, words in (
         (tmp_path / "none.npz", r"no such file; give the policy\.npz"), ("", "^policy is empty"),
-        (tmp_path, r"policy\.npz: it has no model .*; give env\.mu=MU env\.tau=TAU"),
+        (tmp_path, r"policy\.npz: its file has no model .*; set env\.mu=MU env\.tau=TAU"),
         (share, r"it sees \(logit_share, .*\); only density policies can be certified"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=words):
@@ -544,7 +544,7 @@ def test_what_is_told_of_a_certificate_is_what_fails_and_what_comes_closest() ->
         Requirement("noise: half-width", float("nan"), 2.0), Requirement("uncertain: half-width", 0.3, 2.0),
     )  # fmt: skip
     found = Certificate(None, (), checks, (), np.zeros(0), [], None, False)  # type: ignore[arg-type]
-    told = [line.split("  ") for line in found.told()]
+    told = [line.split("  ") for line in found.lines()]
     assert [word for word, _ in told] == ["pass", "pass", "short", "FAIL", "pass"]
     assert [line for _, line in told[2:]] == [str(check) for check in checks[4:]]
     assert told[1][1] == f"{checks[2]}; and 2 more"

@@ -495,7 +495,7 @@ def test_the_plane_holds_every_reading_of_every_state_that_is_carried() -> None:
 
 
 def test_policies_that_cannot_be_asked_say_why() -> None:
-    with pytest.raises(CertificationError, match=r"acts every 1 min, env\.control_min = 2; give env\.control_min=1"):
+    with pytest.raises(CertificationError, match=r"acts every 1 min, but env\.control_min = 2; set env\.control_min=1"):
         question(laws.law(), replace(FAST, env=EnvConfig(control_min=2.0)))
     with pytest.raises(ValueError, match=r"setpoints = \[0.5, 0.5\]: allowed \[low, high\] with low < high"):
         CertifyConfig(setpoints=(0.5, 0.5))
