@@ -29,9 +29,9 @@ Kinds = Callable[[str, str], Any]
 class Meaning:
     """Meaning of a config field and its allowed values. Bounds apply to each entry of a tuple.
 
-    interval: the value is a pair [low, high], low <= high. some: a tuple needs an entry. words: allowed texts instead
-    of a number. note: text after the range in messages. kinds: function (kind, key) -> default config of a part of this
-    kind ("": no kind given), also for each part of a dict; it raises ValueError with the known kinds.
+    interval: the value is a pair [low, high], low <= high. some: a tuple needs at least one entry. words: texts allowed
+    instead of a number. note: text after the range in messages. kinds: function that returns the default config of a
+    part, or of each part of a dict, for its kind ("": none given) and key; it raises ValueError with the known kinds.
     """
 
     what: str
@@ -218,7 +218,7 @@ def _keys(config: Any, prefix: str) -> Iterator[str]:
 
 
 def _meant(name: str, config: Any, prefix: str) -> str:
-    """Suggest the most similar key of the whole tree, as the end of a sentence; "" if there is none."""
+    """Return "; did you mean KEY?" with the most similar key of the whole tree; "" if no key is similar."""
     keys: dict[str, str] = {}
     for key in sorted(_keys(config, prefix), key=lambda key: key.count(".")):
         last = key.rpartition(".")[2]

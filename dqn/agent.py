@@ -118,7 +118,7 @@ class DQNAgent:
     def _minibatches(self, most: int) -> Transition:
         """Draw n <= `most` minibatches of B transitions per agent, (S, n, B); part of each minibatch gets new goals.
 
-        The observations are returned as features of the network, (S, n, B, F), because their map never changes.
+        The observations are returned as features, (S, n, B, F), because the map from one to the other is constant.
         """
         batch = self.replay.sample(self._draws.take(most))
         if self._relabelled:

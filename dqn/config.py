@@ -18,7 +18,7 @@ class DQNConfig:
     gamma: float = setting(0.99, "discount factor per step", at_least=0.0, below=1.0)
     learning_rate: float = setting(1e-3, "learning rate of Adam", above=0.0, at_most=1.0)
     learning_rate_end: float | None = setting(
-        None, "final rate: falls to it in the second half of the updates; null: constant", above=0.0, at_most=1.0
+        None, "final rate; reached from the middle of the updates on; null: constant", above=0.0, at_most=1.0
     )
     total_steps: int = setting(10_000, "length of training", "steps", at_least=1)
     epsilon_start: float = setting(1.0, "exploration rate at step 0", within=(0, 1))
@@ -50,7 +50,7 @@ class DQNConfig:
     )
     reward_scale: float = setting(1.0, "factor by which the agent multiplies the rewards", above=0.0)
     hindsight_share: float = setting(0.0, "fraction of each minibatch whose goals are replaced", within=(0, 1))
-    hindsight_near: float = setting(0.0, "fraction of these goals that are close to the reached state", within=(0, 1))
+    hindsight_near: float = setting(0.0, "fraction of replaced goals close to the reached state", within=(0, 1))
     hindsight_width: tuple[float, float] = setting(
         (1e-3, 0.8), "distance of a close goal from the state, log-uniform", "OD", above=0.0, interval=True
     )

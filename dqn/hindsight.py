@@ -50,7 +50,7 @@ class GoalRelabel:
         self._config, self._reward = config, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Draw a goal from the whole range, and d with its sign; d is infinite for the rest of the batch."""
+        """Draw a goal from the whole range, and d with its sign; d is infinite where the goal may be anywhere."""
         goal = self._low + (self._high - self._low) * uniform[..., 0]
         return torch.stack([goal, _distance(self._config, uniform[..., 1])], dim=-1)
 
@@ -80,7 +80,7 @@ class ShiftRelabel:
         self._config, self._span, self._reward = config, span, reward
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """Draw an error before the step within +-span, and d with its sign; d is infinite for the rest of the batch."""
+        """Draw an error before the step within +-span, and d with its sign; an infinite d is not used."""
         error = self._span * (2.0 * uniform[..., 0] - 1.0)
         return torch.stack([error, _distance(self._config, uniform[..., 1])], dim=-1)
 

@@ -18,7 +18,7 @@ def fast_arithmetic() -> None:
     """Treat numbers below 1e-38 as 0 in this thread, if the processor supports it.
 
     The gradient of an inactive unit is 0. Adam's running mean of it then shrinks by a tenth per update, down to 1e-45.
-    Processors are many times slower with such numbers. Their steps are below 1e-30, so no weight changes.
+    Processors are many times slower with such numbers. They would cause steps below 1e-30, so no weight changes.
     """
     torch.set_flush_denormal(True)
 

@@ -54,7 +54,7 @@ def relative_reward(error: Any) -> Any:
 
 
 def nearest_level(error: Array, growth_share: Array, n: int = 17) -> NDArray[np.intp]:
-    """Return the index of the level nearest to clip(e + s, 0, 1), of two equally near the lower (myopic controller)."""
+    """Return the index of the level nearest to clip(e + s, 0, 1); a tie gives the lower level (myopic controller)."""
     wanted = np.clip(error + growth_share, 0.0, 1.0) * (n - 1)
     return np.asarray(np.ceil(wanted - 0.5).clip(0, n - 1), dtype=np.intp)
 

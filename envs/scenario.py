@@ -133,7 +133,7 @@ class Scenario(Phased):
     announce_min: float | str | None = setting(
         None,
         "how long in advance controllers know a change of setpoint; 0: never; auto: the estimated time for half of the "
-        "change; null: 0, or the default of a second setpoint",
+        "change; null: 0, unless a second signal has another default",
         "min",
         within=(0, 1440),
         words=("auto",),

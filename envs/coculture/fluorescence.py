@@ -22,7 +22,7 @@ DAY_MIN = 1440.0
 
 @dataclass(frozen=True)
 class FluorescenceConfig:
-    """Sensor y = k (f + od_term OD) + offset with pigment f; the default is calibrated, with noise.
+    """Sensor y = k (f + od_term OD) + offset with pigment f; the defaults describe a calibrated sensor with noise.
 
     Seventeen real reactors had k from 0.75 to 1.19 (mean 0.99) and offsets from 151 to 339 (mean 214).
     """

@@ -76,7 +76,7 @@ def _corners(axes: tuple[Array, Array, Array], state: Array) -> tuple[NDArray[np
 
 
 def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the index of the grid point below and the weight of the point above; beyond the axis its ends count."""
+    """Return the index of the point below and the weight of the point above; values are clipped to the axis."""
     position = np.clip((at - axis[0]) / (axis[1] - axis[0]), 0.0, axis.size - 1.0)
     left = np.minimum(position.astype(np.intp), axis.size - 2)
     return left, position - left

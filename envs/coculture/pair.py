@@ -80,7 +80,7 @@ class PigmentConfig:
     centre_c: float = setting(32.5, "temperature subtracted from T in the polynomial", "degC", within=(0, 60))
     least: float = setting(20.0, "smallest production", "counts/OD/h", above=0.0)
     follow_per_h: float = setting(1.6, "rate at which production approaches g_ss", "1/h", within=(0.01, 60))
-    delay_min: int = setting(30, "delay of g in its equation", "min", within=(1, 240))
+    delay_min: int = setting(30, "delay after which production acts on its own change", "min", within=(1, 240))
 
     def __post_init__(self) -> None:
         check(self, "pair.pigment")

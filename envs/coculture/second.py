@@ -26,7 +26,7 @@ class SecondSpeciesConfig:
 
     start_share: tuple[float, float] = setting(
         (0.0, 0.0),
-        "range of its share of the OD at reset, drawn once per vial; [0, 0]: no second species",
+        "range of the second species' share of the OD at reset, drawn once per vial; [0, 0]: no second species",
         within=(0, 1),
         interval=True,
     )
@@ -58,7 +58,7 @@ def of_plant(config: PlantConfig) -> OfPlant:
 
 
 def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
-    """Return the config with the species of another pair; mu of each changes by new / old curve at 37 degC."""
+    """Return the config with the species of another pair; each mu is multiplied by the new / old rate at 37 degC."""
     two = of_plant(config)
     if pair == two.pair:
         return config

@@ -120,7 +120,7 @@ def passed(config: CocultureConfig, goal: Array) -> Array:
 
 
 def at_rest(config: CocultureConfig, x: Array, temperature: Array | float | None = None) -> Array:
-    """Return the state (..., 3) after a long time at one temperature; None: at which both grow equally fast."""
+    """Return the state (..., 3) after a long time at a temperature; None: that of equal growth of both species."""
     warm = config.pair.even_c if temperature is None else temperature
     t = np.broadcast_to(np.asarray(warm, dtype=np.float64), np.shape(x))
     return np.stack([x, t, config.scale_p * config.pair.rates(t)[..., 1]], axis=-1)

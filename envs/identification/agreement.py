@@ -7,7 +7,7 @@ predictions one row ahead,
     e_i = ln y_{i+1} - ln y_i - (mu - u_i/tau) dt_i.
 
 This error shows a wrong mu - u/tau even if a regulated culture does not identify mu and tau separately. Its interval is
-narrow, so one wrong segment counts. Growth or gain must be wrong in two segments in a row: one in twenty is by chance.
+narrow, so one wrong segment is enough. Growth or gain needs two in a row, because one in twenty is wrong by chance.
 """
 
 from dataclasses import dataclass
@@ -71,8 +71,8 @@ class Agreement:
     """Result of the comparison of a run with its model.
 
     growth: mu, 1/min. gain: pump flow relative to the model, tau_model/tau. net: mean of e per minute, 1/min.
-    predicted: OD predicted from the row before, nan without prediction, (n,). rms: its rms error, OD; attainable: the
-    same after subtraction of each segment's mean error. minutes: from the first to the last trustworthy reading.
+    predicted: OD predicted from the row before, nan without prediction, (n,). rms: rms error of `predicted`, OD.
+    attainable: rms error without each segment's mean error, OD. minutes: from first to last trustworthy reading.
     """
 
     series: Series
@@ -171,7 +171,7 @@ def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tupl
 
 
 def _mean(error: Array, time: Array) -> Parameter | None:
-    """Return the mean of e per minute with its 95 % interval (Newey, West 1987, Econometrica 55:703) or None."""
+    """Return the mean of e per minute, with 95 % interval (Newey, West 1987, Econometrica 55:703); else None."""
     seen = np.isfinite(error)
     n = int(seen.sum())
     if n < MIN_READINGS:

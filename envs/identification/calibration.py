@@ -150,7 +150,7 @@ def _limit(result: Calibration, config: IdentifyConfig) -> float:
 
 
 def _free_run(inside: Series, method: str) -> Fit | None:
-    """Run the paper's fit. If it fails, return None for another `method`, else raise NotIdentifiable."""
+    """Run the paper's fit. On failure raise NotIdentifiable if `method` is "free_run", else return None."""
     try:
         return fit(inside)
     except NotIdentifiable:

@@ -61,7 +61,7 @@ class Drift:
 
 
 def pairs(parts: list[Series]) -> list[Pair]:
-    """Estimate (mu, tau) of each series, None where not identifiable; without dilution only mu is."""
+    """Estimate (mu, tau) of each series; None if not identifiable. Without dilution tau is None."""
     found: list[Pair] = []
     for e in estimate(parts, QUICK) if parts else []:
         known = e.condition < WORST_CONDITION and _narrow(e.mu)
@@ -101,7 +101,7 @@ def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
 
 
 def drifts(along: tuple[Segment, ...]) -> bool:
-    """Return whether segments drift: tau by 10 % or mu by a third, outside the 80 % interval, or mu in such a step.
+    """Return whether segments drift beyond chance: tau by 10 %, mu by a third, or mu by a third in one step.
 
     mu may change more because growth fluctuates in the model, and mu is its mean. The rule is stricter than that of a
     warning, because a window must not drift.
@@ -116,7 +116,7 @@ def drifts(along: tuple[Segment, ...]) -> bool:
 
 
 def _steps(found: list[Parameter]) -> bool:
-    """Return whether the mean estimate changes by more than a third, and more than by chance, at any segment.
+    """Return whether, at any segment, the means before and after it differ by a third and by more than chance.
 
     Estimates that are uncertain by more than a third are ignored, because at constant OD all such estimates are biased
     to the same side.
@@ -136,7 +136,7 @@ def _steps(found: list[Parameter]) -> bool:
 
 
 def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift | None:
-    """Fit a line to four or more estimates (else None), weighted by their intervals; scatter widens the slope's."""
+    """Fit a line to four or more estimates (else None), weighted by their intervals; scatter widens the interval."""
     from scipy.special import stdtrit
 
     known = [(s.middle_min, v) for s, v in zip(along, values, strict=True) if v is not None]
@@ -200,7 +200,7 @@ def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: f
 
 
 def _failed(clean: Series, along: tuple[Segment, ...]) -> list[Segment]:
-    """Find segments that do not identify tau although their pump rate is at least the median and most such ones do.
+    """Find segments without an estimate of tau among those with at least the median pump rate, if most have one.
 
     In these segments the recorded pumping did not dilute: the feed failed or the culture collapsed.
     """

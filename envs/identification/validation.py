@@ -21,7 +21,7 @@ SLOPE_MIN = 20.0
 
 @dataclass(frozen=True)
 class Ahead:
-    """RMS errors, % of OD, of predictions of n readings in the second half, `minutes` before each reading.
+    """RMS errors, % of OD, of predictions made `minutes` before each of n readings in the second half.
 
     model_pct: predicted by the model fitted to the first half. od_stays_pct: by a constant OD. same_slope_pct: by a
     constant slope of ln OD, that of the 20 min before."""

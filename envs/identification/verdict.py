@@ -33,7 +33,7 @@ AGAIN = "calibrate again shortly before the run, or use policy=shipped, which ne
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a calibration. word: use, use with care, record again or read again. then: the next step, or ""."""
+    """Verdict. word: use, use with care, record again or read again. why: the reason. then: the next step, or ""."""
 
     word: str
     why: str

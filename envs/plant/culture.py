@@ -170,7 +170,7 @@ class Culture:
         return self._rate(self.substrate[:, None]) * self._relative_rate(age_min)
 
     def _rate(self, substrate: Array) -> Array:
-        """Return the growth rates at 37 degC, (N, S), at a substrate, (N, 1): Monod (1949), mu in fresh medium."""
+        """Return the growth rates at 37 degC, (N, S), by Monod (1949): mu in fresh medium. Args: substrate: (N, 1)."""
         k_s = self.config.k_s
         if np.isinf(self.config.yield_od):
             return self._mu

@@ -54,7 +54,7 @@ class PlantConfig:
 
 
 def with_options(config: PlantConfig, values: Mapping[str, str]) -> PlantConfig:
-    """Return the config changed by options of the vials. Args: values: by keys of `OPTIONS`. Raises: ValueError."""
+    """Return the config with the options in `values`, by keys of `OPTIONS`, applied. Raises: ValueError."""
     for key, (usual, _, change) in OPTIONS.items():
         config = change(config, values.get(key, usual))
     return config

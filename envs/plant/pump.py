@@ -33,7 +33,7 @@ class PumpConfig:
         within=(0.05, 5),
     )
     pulse_cv: float = setting(0.0, "relative spread of a minute's dose", within=(0, 1))
-    pulse_ar: float = setting(0.0, "correlation of that spread from minute to minute", within=(0, 0.95))
+    pulse_ar: float = setting(0.0, "correlation of dose errors from minute to minute", within=(0, 0.95))
     dead_time_s: float = setting(0.0, "initial part of each pulse that delivers nothing", "s", within=(0, 0.5))
     min_pulse_s: float = setting(0.0, "shorter pulses deliver nothing", "s", within=(0, 1))
     timing_error_s: float = setting(

@@ -27,12 +27,12 @@ class SensorConfig:
         0.0, "sd of the logarithm of a slowly varying noise factor (median 1)", within=(0, 1)
     )
     noise_swing_min: float = setting(
-        180.0, "correlation time of that factor, with a reading each minute", "min", within=(1, 10_000)
+        180.0, "correlation time of the slow noise factor, with a reading each minute", "min", within=(1, 10_000)
     )
     lag1: float = setting(0.0, "correlation of the noise of successive readings", within=(0, 0.95))
     gain_cv: float = setting(0.0, "spread between reactors of the slope k in y = k (x + c x^2)", within=(0, 0.3))
-    curvature: float = setting(0.0, "c is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
-    blank_error: float = setting(0.0, "the offset is drawn uniformly within +- this", "OD", within=(0, 0.2))
+    curvature: float = setting(0.0, "c in y = k (x + c x^2), drawn uniformly from this to 0", "1/OD", within=(-0.3, 0))
+    blank_error: float = setting(0.0, "offset, drawn uniformly within +- this", "OD", within=(0, 0.2))
     drift_per_h: float = setting(0.0, "drift of the offset", "OD/h", within=(-0.05, 0.05))
     shift_od: float = setting(0.0, "step of the offset at `shift_min`", "OD", within=(-0.2, 0.2))
     shift_min: float = setting(0.0, "age of the blank at the step", "min", at_least=0.0)
@@ -45,7 +45,7 @@ class SensorConfig:
     blank_counts: float = setting(
         14000.0, "mean counts of clear medium, 10 to 25 thousand in public logs", "counts", within=(3000, 60000)
     )
-    blank_cv: float = setting(0.0, "relative spread of these counts between reactors", within=(0, 0.25))
+    blank_cv: float = setting(0.0, "relative spread of blank_counts between reactors", within=(0, 0.25))
 
     def __post_init__(self) -> None:
         check(self, "plant.sensor")

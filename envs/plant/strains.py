@@ -54,7 +54,7 @@ def add_law(name: str, make: Callable[[Any, float, int], Curve]) -> None:
 
 
 def response(law: str, plant: Any, activation_kj_mol: float, number: int) -> Curve:
-    """Return phi(T) / phi(37 degC) of a law of `TEMPERATURE_LAWS`; the other arguments are those of `make`."""
+    """Return phi(T) / phi(37 degC) of a law of `TEMPERATURE_LAWS`; the other arguments go to its `make` function."""
     phi = LAWS[law](plant, activation_kj_mol, number)
     reference = phi(np.asarray(REFERENCE_TEMPERATURE))
     return lambda temperature: phi(temperature) / reference

@@ -23,7 +23,7 @@ class VesselConfig:
     volume_ml: float | None = setting(
         None, "mean culture volume up to the waste tube; null: that of the bench", "mL", within=(5, 50)
     )
-    volume_sd_ml: float = setting(0.0, "sd of that volume between vials", "mL", within=(0, 1.5))
+    volume_sd_ml: float = setting(0.0, "sd of the volume between vials", "mL", within=(0, 1.5))
     overflow_above_ml: float = setting(
         2.0, "height of the overflow pump's tube above the waste tube, as volume", "mL", within=(0, 10)
     )

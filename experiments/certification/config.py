@@ -26,7 +26,7 @@ class Limits:
         "OD",
         within=(0, 1),
     )
-    excess_uncertain: float = setting(0.025, "the same with noise and uncertainty", "OD", within=(0, 1))
+    excess_uncertain: float = setting(0.025, "`excess` with noise and uncertainty", "OD", within=(0, 1))
     entry: float = setting(
         1.15,
         "time to enter the allowed half-width, over that of a pump at full rate or off",
@@ -44,23 +44,23 @@ class Limits:
         "periods of full pump",
         within=(0, 10),
     )
-    excess_share: float = setting(1 / 64, "the same with errors, in every case", "periods of full pump", within=(0, 10))
-    late: float = setting(1, "time by which it enters after the one-line controller", "periods", within=(0, 1000))
-    late_slow: float = setting(4, "the same with a lasting error of the gain", "periods", within=(0, 1000))
+    excess_share: float = setting(
+        1 / 64, "`excess_nominal` with errors, in every case", "periods of full pump", within=(0, 10)
+    )
+    late: float = setting(1, "delay of the entry after the one-line controller's", "periods", within=(0, 1000))
+    late_slow: float = setting(4, "`late` with a lasting error of the gain", "periods", within=(0, 1000))
     reached: float = setting(0.95, "fraction of a band that trajectories must reach, with errors", within=(0, 1))
-    reached_nominal: float = setting(0.9, "the same, exact estimates", within=(0, 1))
+    reached_nominal: float = setting(0.9, "`reached` with exact estimates", within=(0, 1))
     safe_excess: float = setting(
         0.05, "safety: half-width beyond the one-line controller's, without noise, nominal model", "OD", within=(0, 1)
     )
     safe_excess_median: float = setting(
         0.01,
-        "safety: median of this excess over the setpoints; detects a policy for another pump",
+        "safety: median of `safe_excess` over the setpoints; detects a policy for another pump",
         "OD",
         within=(0, 1),
     )
-    safe_excess_uncertain: float = setting(
-        0.2, "safety: like safe_excess, with noise and uncertainty", "OD", within=(0, 1)
-    )
+    safe_excess_uncertain: float = setting(0.2, "safety: `safe_excess` with noise and uncertainty", "OD", within=(0, 1))
     safe_excess_share: float = setting(
         0.025,
         "safety, policy of (error, growth share), in every case: half-width beyond the one-line controller's",
@@ -112,7 +112,7 @@ class CertifyConfig:
         (0.05, 0.97), "range of mu h / B, for a policy of (error, growth share)", within=(0, 1), interval=True
     )
     error: float = setting(0.1, "largest error of the estimate of e = ln(x / r) / B", within=(0, 5))
-    error_od: float = setting(0.005, "largest error of the OD estimate, if this allows more", "OD", within=(0, 0.2))
+    error_od: float = setting(0.005, "largest error of the OD estimate; above `error` at low OD", "OD", within=(0, 0.2))
     error_share: float = setting(0.05, "largest error of the estimate of the growth share", within=(0, 0.5))
     error_gain: float = setting(
         0.2, "relative error of a dose's effect: random for each dose, or lasting", within=(0, 0.5)
@@ -126,7 +126,7 @@ class CertifyConfig:
     watched_od: float = setting(
         0.04, "largest error of the OD estimate at which the supervisor lets the policy act", "OD", within=(0, 0.2)
     )
-    watched_share: float = setting(0.5, "the same for the growth share", within=(0, 0.5))
+    watched_share: float = setting(0.5, "like `watched_od`, for the growth share", within=(0, 0.5))
     trajectories: int = setting(
         20_000,
         "simulated worst-case trajectories per case, which try to leave the band",

@@ -165,7 +165,7 @@ def _half(policy: Policy) -> int:
 
 
 def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Requirement]:
-    """Yield requirements by simulated worst-case trajectories: none leaves its band, all together fill the band."""
+    """Yield two requirements on worst-case trajectories: none leaves its band, and together they fill the band."""
     once = {asked.loop.key(proof.case): proof for proof in reversed(proofs)} if trajectories else {}
     proofs = [proof for proof in proofs if proof in once.values()]
     found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs]

@@ -125,7 +125,7 @@ class OdLoop(Loop):
         return np.broadcast_to(change, (self.low.size, *change.shape))
 
     def _change(self, factor: Array | float) -> Array:
-        """Return the change of d if mu and tau are multiplied by `factor`; the smallest factor gives the smallest."""
+        """Return the change of d in a period if mu and tau are multiplied by `factor`; it rises with the factor."""
         return np.asarray(self.control_min * (self.mu * factor - self.levels / (self.tau * factor)))
 
     def range(self, case: OdCase) -> Array:

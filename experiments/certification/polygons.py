@@ -204,7 +204,7 @@ def possible(network: Network, low: Array, high: Array) -> NDArray[np.bool_]:
 
 
 def contradictions(network: Network, regions: Regions, grid: tuple[int, int]) -> int:
-    """Count corners of polygons whose action is impossible by the bounds of their box, for a grid of boxes.
+    """Count the corners of polygons at which `possible` excludes the polygon's action, for boxes of a grid.
 
     If the polygons do not tile the rectangle exactly, the count is one higher.
     """

@@ -91,7 +91,7 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
 def dose_below(loop: Loop, points: Points, action: Index, case: Any, actions: Sequence[int]) -> Array:
     """Return the largest distance below the setpoint at which each action or a higher one may be chosen, (actions, S).
 
-    The unit is periods of growth. The value is 0 for actions chosen only above the setpoint, and limited to the starts.
+    The unit is periods of growth. It is 0 for actions chosen only above the setpoint, and limited by the lowest start.
     """
     pieces = points.pieces(action, loop.states(case), loop.low.size)
     lowest = np.stack([pieces.lowest(a) for a in actions])
