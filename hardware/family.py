@@ -170,7 +170,7 @@ class Family:
         """Check that the bench's period, volumes and largest rate suit the reactors. Raises: UnfitError."""
 
     def gives(self, backend: Any, bench: Bench, pumps: Sequence[Set[int]], who: str) -> None:
-        """Check that spare pumps, by number for each reactor, can serve the config key `who`. Raises: UnfitError."""
+        """Check that each reactor has the spare pumps, by number, that the key `who` needs. Raises: UnfitError."""
         if not any(pumps):
             return
         most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML

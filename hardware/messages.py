@@ -61,7 +61,7 @@ class PreflightFailed(DeviceStateError, says="preflight: {count} of {of} checks 
 class PumpsNotLookedAt(Message, says="stopped before the pumps were checked: pumps not verified off",
     remedy="look at the pumps, then resume the run"):
     """A pump may still be on from before the interruption."""
-class ClockMoved(Message, says="this computer's clock was set by {by_min:.1f} min since the run's last row; "
+class ClockMoved(Message, says="this computer's clock was moved by {by_min:.1f} min since the run's last row; "
     "the run ignores this and continues at minute {minute:.1f}", remedy="correct the clock, check its battery"):
     """The run uses the device's cycles and the monotonic clock instead."""
 class ClockDoubtful(Message,

@@ -115,7 +115,7 @@ class Reactor(Protocol):
         """Wait for a new sample of at least one reactor; if no sample comes in time, return without a fresh one.
 
         Faults of single reactors are in `vitals`, so that the others continue.
-        Raises: ReactorError for an error that does not pass.
+        Raises: ReactorError for a permanent error.
         """
 
     def actuate(self, command: Command) -> Receipt:

@@ -347,7 +347,7 @@ class BoardAgent:
             pause = min(2.0 * pause, RETRY_S[1])
 
     def sweep(self, beats: int) -> list[str]:
-        """Switch off all present reactors once; return what was not verified. Ends early if a client is back."""
+        """Switch off the pumps of all present reactors; return what was not verified. End early if a client is back."""
         problems = []
         try:
             with self.lock:
@@ -557,7 +557,7 @@ def read_token(path: str | None) -> bytes:
 class Proxy(socketserver.ThreadingTCPServer):
     """HTTP server of the agent; see the module's docstring.
 
-    Args: address: where to listen. agent. token: secret of its clients. names: names of this board that Host may have.
+    Args: address: where to listen. agent. token: secret of its clients. names: names of this board in a Host field.
     """
 
     daemon_threads = True
@@ -715,7 +715,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"board_agent: {problem}", file=sys.stderr)
         return 2
     ends = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # in every thread: a handler waits until the main one is woken
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # in all threads; sigwait below takes them
     agent.start()
     if port is not None:
         threading.Thread(target=port.run, daemon=True).start()

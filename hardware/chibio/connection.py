@@ -21,7 +21,7 @@ DRAIN = 0.25
 
 
 def identity(transport: Transport, clock: Clock, where: str) -> str:
-    """Read the identity of the first present reactor. Args: where: the link, for errors. Raises: `Connection.read`."""
+    """Read the first present reactor's identity. Args: where: name of the link. Raises: as `Connection.read`."""
     reply = transport.get("/getSysdata/")
     if reply.status != 200:
         raise messages.WrongStatus(request=f"{where}: GET /getSysdata/", status=reply.status, expected=200)
@@ -100,7 +100,7 @@ class Connection:
         if (
             last is not None
             and (last.selected, last.start_time) == (state.selected, state.start_time)
-            and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # not the board's clock
+            and (state.cycles, state.sample_s) < (last.cycles, last.sample_s)  # else only the clock was set
         ):
             raise messages.OldAnswer()
         if self.name not in state.present:

@@ -10,7 +10,7 @@ from hardware.messages import Fault
 
 
 def regulates(state: DeviceState, setpoint: float) -> bool:
-    """Whether the device regulates at `setpoint`; False for nan."""
+    """Return whether the device regulates at `setpoint`; False for nan."""
     return state.regulating and abs(state.regulation_target - setpoint) <= 1e-5
 
 

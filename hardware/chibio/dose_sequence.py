@@ -21,7 +21,7 @@ from hardware.logbook import Logbook
 from hardware.messages import DoseUnderWay, NoDose, NoNewSample, OpenDose
 from hardware.storage.doses import Given
 
-DOSE_OFF_S = 2.0  # from the end of a dose, which the device makes itself, to the off command: delays of link and bus
+DOSE_OFF_S = 2.0  # from the planned end of a dose to the off command, for delays of link and bus
 WASTE_FIRST_S = 1.0  # from waste pump on to feed pump on: a motor starts 0.2 to 0.7 s after the answer
 LATE_S = 3600.0  # a tunnel may deliver a command up to this long after the client gave up on it
 REFUSALS = 4  # failed attempts in a row to switch the pumps off, until the experiment is ended
@@ -256,7 +256,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """Read the pumps before they are switched off. Raises: an error if an answer was missing or a dose is open."""
+        """Read the pumps before they are switched off. Raises: as `read`, if an answer is missing or a dose open."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:

@@ -1,4 +1,4 @@
-"""Volume to pump time: the one place where mL become a duty (docs/device.md, Pumps and Waste)."""
+"""Conversion of volumes to pump times: only here mL become a duty (docs/device.md, Pumps and Waste)."""
 
 import math
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 class PumpCalibration:
     """Volume of one dose: v = flow_ml_s * (63 s * duty + bias_s), with a relative spread from dose to dose.
 
-    bias_s: negative where the motor delivers nothing for that long. Raises: ValueError naming key, value and range.
+    bias_s: negative if the motor delivers nothing for this time. Raises: ValueError naming key, value and range.
     """
 
     flow_ml_s: float = setting(1.0, "flow at full power", "mL/s", within=(0.05, 5.0))

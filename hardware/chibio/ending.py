@@ -26,7 +26,7 @@ OFF = (  # a pump is found off: evidence, and the two times between which it wen
     ("an agent that does not say had the time", "on", "silence"),
     ("it was asked off without an answer", "tried", "now"),  # done at once, or when a tunnel delivered it
     ("the experiment was ended", "last answer", "now"),
-    ("its program was killed, and its waste pump is on", "end", "end"),  # by that program; an agent ends both
+    ("its program was killed, and its waste pump is on", "end", "end"),  # an agent would have ended both
     ("no answer says that it went on", "asked", "asked"),  # and it never did
     ("nothing", "on", "now"),  # somebody switched it off
 )

@@ -58,7 +58,7 @@ class FluorescenceSlotConfig:
         return "" if found == (self.led, self.base_band, self.band, self.gain) else f"set to {', '.join(found)}"
 
     def others_on(self, state: DeviceState) -> tuple[str, ...]:
-        """List the modes that are on beside the slot that this run uses."""
+        """List the modes that are on, without the slot that this run uses."""
         return tuple(m for m in state.modes if not (self.measure and m == self.slot))
 
 

@@ -67,7 +67,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _link(transport: Transport, clock: Clock, speed: float) -> Check:
-    """Check the time until an answer, device s. With a fast emulator it depends on the load of the computer."""
+    """Check how fast the device answers, device s. A fast emulator's time depends on the load of the computer."""
     start = clock.now()
     for _ in range(3):
         transport.get("/getSysdata/")

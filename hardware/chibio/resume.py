@@ -22,7 +22,7 @@ Span = tuple[float, float]
 class ReactorHistory(History):
     """State of one reactor, beyond that of `History`. A sample's key is (record time, cycles).
 
-    overflow_pump_on: the overflow pump was verified on. start_time: start of the device's experiment. The others are of
+    overflow_pump_on: the overflow pump was verified on. start_time: start of the device's experiment. The rest is about
     an open dose. feed_s, waste_s: planned on-times, s. feed_pump: pump that feeds. experiment: start_time when the dose
     began. feed_on, waste_on, feed_off, waste_off: run times between which this pump went on or off, from the answer to
     its command or from a read; nan if unknown. feed_tried, waste_tried: run time of the first off command that failed.

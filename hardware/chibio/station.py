@@ -79,7 +79,7 @@ class ChibioStation(Station):
         self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
-        """Task: start the experiment with the run's settings, or adopt it. Args: waited: no old cycle can be left."""
+        """Task: start the experiment with the run's settings, or adopt it. Args: waited: no old cycle still runs."""
         try:
             yield from self._let_measure()
             state = self.connection.read()

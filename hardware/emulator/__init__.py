@@ -1,3 +1,3 @@
-"""A Chi.Bio in software, down to its threads, timing and faults, in front of a simulated vial.
+"""A Chi.Bio in software: its threads, timing and faults, around simulated vials.
 
 `python -m hardware.emulator` serves it over HTTP; tests and rehearsals call it in the same process."""

@@ -100,7 +100,7 @@ class EmulatorServer:
         return request
 
     def control(self, method: str, path: str) -> tuple[int, bytes]:
-        """Answer the emulator's own routes: status and body."""
+        """Answer one of the emulator's own routes; return status and body."""
         parts = path.removeprefix(PREFIX).strip("/").split("/")
         device = self.device
         with self.lock:
@@ -131,7 +131,7 @@ def _json(value: object) -> bytes:
 
 
 class _DevicePort(HTTPServer):
-    """The device's port. fates: how connections end without an answer, "reset" or "lost". held: the lost ones."""
+    """The device's port. fates: how connections end without an answer, "reset" or "lost". held: lost connections."""
 
     timeout = POLL_S
     allow_reuse_address = True

@@ -34,7 +34,7 @@ class ReactorApp(Position):
 
 
 class Software:
-    """Memory of one process; at first every position is as after `initialise()`. Args: vials: by plugged position."""
+    """Memory of one process; at first every position is as after `initialise()`. Args: vials: by position."""
 
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
         self.computer, self.selected = computer, "M0"

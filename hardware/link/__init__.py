@@ -1,3 +1,3 @@
 """Links to devices: HTTP, serial line, MQTT, and the lock that excludes a second client.
 
-Entered by drivers. Knows bytes, no device."""
+Drivers use it. It handles bytes and knows no device."""

@@ -1,4 +1,4 @@
-"""HTTP, straight to the device's server."""
+"""HTTP to the device's server or its board agent."""
 
 import contextlib
 import signal
@@ -96,7 +96,7 @@ def fetch(
     except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
         if time.monotonic() > deadline:
             raise messages.NotComplete(request=what, seconds=wait_s) from error
-        if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
+        if "without sending" in str(error):  # the server ended before the answer was complete
             raise messages.CutOff(request=what, url=url) from error
         raise messages.NotHttp(request=what, why=error) from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:

@@ -24,7 +24,7 @@ class AgentReachesNobody(LinkError, says="{request}: the board agent cannot reac
 class AgentReports(ProtocolError, says="{request}: the board agent reports status {status} ({why})"): ...
 class AgentNotReadable(ProtocolError, says="the board agent's {what} is not readable: {said!r}",
     remedy="copy the agent to the board again"):
-    """Another version of the agent, or another program; the run does not start."""
+    """The board has another version of the agent, or another program. The run does not start."""
 class AgentOutdated(ProtocolError, says="the board agent speaks protocol {protocol}, this driver protocol 2",
     remedy="copy this version's agent to the board"): ...
 class PortNotOpened(LinkError, says="serial port {port}: {error}",

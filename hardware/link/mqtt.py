@@ -83,7 +83,7 @@ class MqttLink:
         self._client.publish(self._will, payload, qos=1, retain=True)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         if self._kept and self.connected:
             self._kept = ""
             with contextlib.suppress(RuntimeError, ValueError):

@@ -16,7 +16,7 @@ FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's largest volume in each vial
 
 
 def vial_ml(volume_ml: float) -> int:
-    """Return the vendor's vial for a culture of this volume, mL."""
+    """Return the size of the vendor's vial for a culture volume, mL."""
     return 20 if volume_ml <= 15.0 else 40
 
 

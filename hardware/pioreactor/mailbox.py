@@ -70,8 +70,8 @@ class Pin:
     def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
         """Process a report of all pins of the unit. Args: at: its time, -inf if it was retained and the pin is on.
 
-        echoes: other jobs report pins, too, but late. Without a live job (word), on therefore counts only if reported
-        twice.
+        word: state of the pump's job. echoes: other jobs report pins, too, but late: without a live job, on then counts
+        only if it is reported twice.
         """
         if not on:
             self.ends(at)
@@ -205,7 +205,7 @@ class Mailbox:
         self.readings.append(Reading(now, value, bool(mine.get("calibrated"))))
 
     def forget(self) -> None:
-        """Forget the states of jobs, which report them again; a pump's job ends if it loses the broker."""
+        """Forget the states of all jobs, which the jobs report again. A pump's job ends if it loses the broker."""
         with self.lock:
             self.states.clear()
             for pin in self.pins.values():
@@ -252,7 +252,7 @@ class Cluster(MqttLink):
         )  # fmt: skip
 
     def _forget(self) -> None:
-        """Forget, after a broken connection, reports that may have changed; retained ones arrive again."""
+        """Forget all reports after a loss of the connection, because they may be outdated; retained ones come again."""
         self._others.clear()
         for box in self._boxes.values():
             box.forget()

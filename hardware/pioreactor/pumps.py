@@ -107,7 +107,7 @@ class Pumps:
       only switch a pin off. flow_ml_s: by job, from the active calibrations. reported: mL by job and source of events.
       counted: mL by job and source that are booked with a dose, inf while it is under way. facts: facts on the unit's
       version. boot: when the unit was started. proven: times at which `end` proved pumps off. trouble: fault against
-      any dose, or None. barred: jobs that must end. waits: the current dose waits for something outside. flowed_ml:
+      any dose, or None. barred: jobs that must end. waits: the current dose waits for unit or user. flowed_ml:
       largest volume so far of a media pump that is not proven off. runs_on: this pump must be drained.
     """
 
@@ -284,7 +284,7 @@ class Pumps:
         return Moved(low, max(high, round(ran_ml, 4)), end)  # on a busy unit a job ends late
 
     def end(self, request: Request) -> Steps[Moved]:
-        """Stop a pump that has begun, or may have begun, until it is proven off; return the volume that it moved."""
+        """Stop a pump that has begun, or may have; once it is proven off, return the volume that it moved."""
         job, ending, pin = request.job, ForcedEnd(self, request), self.pins[request.job]
         while math.isnan(off_s := ending.off_s()):
             ending.act()
@@ -394,7 +394,7 @@ class ForcedEnd:
 
     @property
     def failed(self) -> bool:
-        """Whether the proof failed: a short run found a lock, or it takes too long."""
+        """Whether the proof failed: a short run found a lock, or the proof takes too long."""
         now, state = self._p.clock.now(), self._p.box.state(self._job)
         refused = state.word == "disconnected" and self._short_s < state.at < now - SETTLE_S
         return now > self._apart_s + PROOF_S or (refused and self._shorts() == self._shorts_before)

@@ -1,4 +1,4 @@
-"""From the vendor's readings to one sample per control period: the median of the readings without a dose."""
+"""From the vendor's readings to one sample per control period: the median of readings that no dose disturbed."""
 
 import math
 from collections import deque

@@ -249,7 +249,7 @@ class PioreactorStation(Station):
         self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Send the thermostat its target until it reports it; restart one that no longer responds."""
+        """Send the target until the thermostat reports it; restart a thermostat that does not respond."""
         if not self._target_sent_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
@@ -262,7 +262,7 @@ class PioreactorStation(Station):
             self._listed.discard(HEAT)
 
     def pumps_off(self, real_s: float = PUMPS_S, final: bool = False) -> Iterator[float]:
-        """Switch every pump off, verified; cut a dose, its waste only if final. Raises: DeviceStateError."""
+        """Switch every pump off, verified; end a dose, but its waste only if final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
         pumps.barred = PUMPS if final else (MEDIA, ALT)
         try:
@@ -307,7 +307,7 @@ class PioreactorStation(Station):
             yield STEP_S
 
     def regulate(self, setpoint: float) -> Iterator[float]:
-        """Hand the vial over to the vendor's turbidostat; done once that runs as set. Raises: ReactorError."""
+        """Hand the vial over to the vendor's turbidostat; done when its settings are right. Raises: ReactorError."""
         yield from self.pumps_off(self._config.stop_s)
         self.regulated_od, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
         try:

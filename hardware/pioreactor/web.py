@@ -127,7 +127,7 @@ class Web:
 class Calls:
     """HTTP requests without waiting: one of each kind at a time, at a limited rate.
 
-    Attributes: failed: kinds whose last request failed: time of the first failure, and the error.
+    Attributes: failed: for each kind whose last request failed, the time of the first failure and the last error.
     """
 
     def __init__(self, web: Web, clock: Clock) -> None:

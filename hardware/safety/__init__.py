@@ -1,3 +1,3 @@
 """The interlock between every controller and every pump.
 
-Entered by whatever assembles a closed loop. Knows measurements and receipts, no device."""
+The code that builds a closed loop uses it. It handles measurements and receipts, and knows no device."""

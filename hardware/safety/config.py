@@ -111,7 +111,7 @@ class SafetyConfig:
         require(low <= high, "safety.composition_high", high, f"{low:g} to 42")
 
     def response(self, fault: Fault | type[Fault]) -> Response:
-        """Return the response to a fault: what the lab chose, else what the fault declares."""
+        """Return the response to a fault: the lab's choice, else that of the fault's class."""
         return WORDS[getattr(self.responses, fault.kind, fault.response)]
 
     def ml_a_minute(self, bench: Bench) -> float:

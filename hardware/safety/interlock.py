@@ -160,7 +160,7 @@ class Interlock:
                 found[i].append(pause(minutes=float(self._hold_until_s[i] - now) / 60.0))
 
     def _conclude(self, found: list[list[Fault]], allowed: Array, setpoint: Array) -> Ruling:
-        """Choose the most severe response per reactor, never below what is latched."""
+        """Choose the most severe response per reactor, at least the latched one."""
         response = np.array([max(map(self._response, faults), default=0) for faults in found], dtype=np.int64)
         self._latched = np.where(response >= Response.REGULATE, np.maximum(self._latched, response), self._latched)
         response = np.maximum(response, self._latched.astype(np.int64))

@@ -29,7 +29,7 @@ class CannotHoldFault(Fault, says="full feed does not bring OD down to {setpoint
     """The pump doses the permitted maximum. Doses continue while this lasts."""
 class DosesNotTaken(UndosedFault, says="{owed_ml:.2f} mL were allowed, nothing was dosed",
     remedy="read the run's notes above this line"):
-    """The device gave none of the allowed doses: the link is too slow, or the device is not as set."""
+    """The device gave none of the allowed doses: the link is too slow, or its settings were changed."""
 class BottleFault(Fault, says="{left_ml:.2f} mL left in the bottle, {asked_ml:.2f} mL requested",
     remedy="fill the bottle, then: python -m experiments.mark run=RUN reactor=NAME bottle_ml=ML", response="hold"):
     """According to the run's ledger the bottle is empty. No dose until you mark the bottle as filled."""

@@ -122,7 +122,7 @@ class Heat:
         seen = np.isfinite(self._target_c)
         self._relieve(temperature, target, known, now)
         in_range = known & (temperature > 5.0) & (temperature < 70.0)
-        nonsense = asked & ~in_range & (seen | known)  # a thermometer that falls silent, too
+        nonsense = asked & ~in_range & (seen | known)  # also nan after a valid reading
         hot = in_range & (temperature > target + HOT_EXCESS_C + self._relief_c)
         too_hot = in_range & (temperature > MAX_TEMPERATURE_C)
         scalding = too_hot & (temperature > MAX_TEMPERATURE_C + 3.0)
@@ -138,7 +138,7 @@ class Heat:
         ]
 
     def _relieve(self, temperature: Array, target: Array, known: Mask, now: float) -> None:
-        """Raise the limit by a drop of the target, also at a run's start; the rise decays with the cooling time."""
+        """Raise the limit after a drop of the target, or at a run's start; the rise decays as a vial cools."""
         seen = np.isfinite(self._target_c)
         minutes = np.where(known & seen, (now - self._thermo_s) / 60.0, 0.0)
         drop = np.where(known & seen, np.maximum(self._target_c - target, 0.0), 0.0)

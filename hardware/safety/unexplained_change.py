@@ -68,7 +68,7 @@ class UnexplainedChange:
         return np.asarray(believed & (~step | settled))
 
     def _steps(self, od: Array, t: Array) -> tuple[Mask, Mask, Array, Mask]:
-        """Return rows with a step, rows that fell, agreeing steps in a row, and rows where these suffice.
+        """Return rows with a step, rows below the band, agreeing steps in a row, and rows where these suffice.
 
         Args: od: valid readings, else nan, shape (N,). t: times at which they were taken, min, shape (N,).
         """
@@ -118,7 +118,7 @@ class UnexplainedChange:
         level = np.where(usual, od, 1.0)
         limit = c.drift + 6.0 * np.hypot(c.noise_od, c.noise_fraction * level) / level
         sums = np.stack([excess, deficit, futile], axis=1)
-        over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
+        over = np.where(sums > limit[:, None], self._over + 1, 0)  # a single outlier exceeds it only once
         self._over = np.where(usual[:, None], over, self._over)
         rising, falling, futile_now = (self._over >= PERSISTENCE).T & usual
         short = full & (od > setpoint * (1.0 + c.drift))

@@ -1,3 +1,3 @@
-"""What must survive a power cut: journal, recordings, atomic files.
+"""Files that must survive a power cut: journal, recordings, atomic files.
 
-Entered by the record of a run, by resume, and by whatever writes a file that must be whole."""
+The record of a run, a resume, and all code that writes a file atomically use it."""

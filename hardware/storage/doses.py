@@ -120,7 +120,7 @@ class Dosed:
 
 
 def feeds_by(row: Mapping[str, Any]) -> str:
-    """Return the pump that feeds by an intent. Raises: ValueError for an unknown pump."""
+    """Return the pump that feeds in the dose of an intent. Raises: ValueError for an unknown pump."""
     pump = str(row.get("feed_pump", "Pump1"))
     if pump not in FEEDS:
         raise ValueError(f"feed_pump {pump}")
@@ -145,7 +145,7 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
                 begun[name] = Dosed(row["n"], name, *_moved(row, "on_s"), pump=FEEDS[feeds_by(row)])
             elif kind == "feed_on" and name in begun:
                 given[begun[name].n] = begun[name]
-            elif kind == "given":  # beside our doses
+            elif kind == "given":  # without a dose of this run
                 repeated.append(Dosed(row["n"], name, *_moved(row, "at_s"), again=True, pump=int(row.get("pump", 1))))
             elif kind == "dose_end" and "feed_times" in row:
                 ending, pump = Ending.of_row(row), 1

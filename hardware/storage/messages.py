@@ -13,9 +13,9 @@ class JournalTaken(RecordingError, says="journal {path}: another program writes 
 class JournalMissing(RecordingError, says="journal {path}: missing or empty",
     remedy="restore it or start a new run"): ...
 class RowDamaged(RecordingError, says="{path}: {what}",
-    remedy="the file was changed by hand: put it back as the run wrote it, or start a new run"): ...
+    remedy="the file was changed by hand: restore what the run wrote, or start a new run"): ...
 class NotRecording(RecordingError, says="{path}: {why}", remedy="{help}"):
-    """The path holds a file that is not this recording; not resumed."""
+    """The path holds a file that is not this recording. The run is not resumed."""
 class WrongRow(RecordingError, says="{path}: row lacks columns {missing} and has unknown columns {unknown}",
     remedy="report it"):
     """An error in the program; the run ends."""

@@ -1,4 +1,4 @@
-"""The writer of the one recording format of the project.
+"""Writer of the project's only recording format.
 
 A recording is a CSV: one row per control period, units in the header, OD measured at the row's time, pump rate held
 from that row to the next. Neither a crash nor a power cut costs more than the row being written.

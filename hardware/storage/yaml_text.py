@@ -16,7 +16,7 @@ def problem(error: Exception) -> str:
 
 
 def read_text(path: Path | str) -> str:
-    """Read a YAML file; aliases, which may stand for gigabytes, are refused. Raises: OSError; ValueError, one line."""
+    """Read a YAML file; aliases, which may stand for gigabytes, are refused. Raises: OSError; one-line ValueError."""
     with open(path, "rb") as f:
         data = f.read(LARGEST + 1)
     if len(data) > LARGEST:

@@ -1,5 +1,5 @@
 """Reactors that are only read, while another program regulates them.
 
 Nothing here can send a command: a Chi.Bio gets only GET requests, a Pioreactor's broker only subscriptions.
-Entered by `deploy watch=true`.
+`deploy watch=true` uses it.
 """

@@ -1,4 +1,4 @@
-"""A Chi.Bio that is only read: one GET, whose reply has the sample and the feed pump's commands since the last one.
+"""A Chi.Bio that is only read: a GET, whose reply has the sample and the feed pump's commands since the last sample.
 
 The device shows the reactor that is selected in its web page. A selection is a command, so this program selects none.
 """

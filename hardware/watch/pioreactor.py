@@ -14,7 +14,7 @@ from hardware.watched import Watched
 
 LOOK_S, FIRST_S, AGAIN_S = 0.05, 30.0, 20.0  # real s: between two looks; until the broker answers; of a `measure`
 REST_S = 15.0  # after a dose until readings count again: pumps, stirring
-SILENT_S = 45.0  # without a reading
+SILENT_S = 45.0  # time without a reading until a fault
 
 
 class WatchedPioreactors(Watched):

@@ -105,7 +105,7 @@ def test_a_journal_row_that_was_damaged(run: Rehearsal, kind: str, change: Chang
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     change(next(row for row in rows if row["kind"] == kind))
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    refused(run, "journal", why, "put it back as the run wrote it, or start a new run")
+    refused(run, "journal", why, "restore what the run wrote, or start a new run")
 
 
 @pytest.mark.parametrize(

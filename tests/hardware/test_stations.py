@@ -299,11 +299,11 @@ def test_a_resumed_run_without_its_journal_is_not_a_new_one(tmp_path: Path) -> N
         (Bench(volume_ml=14.0, volumes_ml={"M5": 29.9}), None),
         (
             Bench(volume_ml=20.0, volumes_ml={"M5": 30.0}),
-            "bench.volume_ml = 30 mL of M5: allowed 10, .* to less than 30",
+            "bench.volume_ml = 30 mL of M5: allowed 10 .* to less than 30",
         ),
         (Bench(volume_ml=20.0, volumes_ml={"M0": 9.9}), "bench.volume_ml = 9.9 mL of M0"),
         (Bench(volume_ml=40.0 - 2.5, volumes_ml={"M0": 12.0, "M5": 12.0}), None),
-        (Bench(period_s=61.0), "bench.period_s = 61 s: allowed 60 with backend=chibio"),
+        (Bench(period_s=61.0), "bench.period_s = 61 s: allowed 60, .*backend=chibio"),
     ],
 )
 def test_every_culture_fits_its_own_vial(bench: Bench, words: str | None) -> None:
