@@ -26,7 +26,7 @@ def episodes(
     best_temperature: Array,
     species: str,
 ) -> Figure:
-    """Draw noise-free episodes, one column each: share with setpoint, and thermostat targets; policy and optimum.
+    """Draw noise-free episodes of policy and optimum, one column each: share with setpoint, and thermostat targets.
 
     Args: hours: (K,). wanted, learned, best: setpoint, share of the policy, share of the optimum, (K, G).
       temperature, best_temperature: targets of policy and optimum, degC, (K, G). species: name of the second species.

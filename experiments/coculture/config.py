@@ -93,10 +93,7 @@ class OfBenchmark:
         learned = [k for k, c in self.compositions.items() if registry.takes(c.kind, "policy", SHARE)]
         for name in self.composition_policies:
             require(
-                name in learned,
-                "composition_policies",
-                name,
-                ", ".join(learned) or "none, because no controller uses a policy",
+                name in learned, "composition_policies", name, ", ".join(learned) or "none: no controller needs one"
             )
         of_two = {name: study for name, study in config.studies.items() if of_study(study).compositions}
         same = len(of_two) in (0, len(config.studies))

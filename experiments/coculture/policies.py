@@ -49,10 +49,7 @@ def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Pol
 
 
 def check_shares(policy: Policy, kind: str, programs: list[Program], forced: bool) -> None:
-    """Check that a policy was trained for the requested shares; beyond its range it would hold the range's end.
-
-    Raises: UserError, unless `forced`; then it logs a warning.
-    """
+    """Check that a policy was trained for the requested shares. Raises: UserError; if `forced`, it logs a warning."""
     low, high = policy.metadata["model"]["setpoints"]
     outside = sorted({s for p in programs for s in p.extremes if not low - 1e-9 <= s <= high + 1e-9})
     if not outside:

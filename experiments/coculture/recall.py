@@ -118,10 +118,7 @@ class Recall:
         return True
 
     def retell(self, shown: Iterable[Shown]) -> None:
-        """Replay the calls that a resumed run received before the resume and after `known`, in order.
-
-        Until the replay is complete, the estimate is the saved one.
-        """
+        """Replay calls from before a resume and after `known`, in order; until then the estimate is the saved one."""
         self._forget()
         last = self.known
         for minute, method, arguments in shown:

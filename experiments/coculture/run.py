@@ -38,10 +38,7 @@ class TwoSpecies(Guest):
     """Guest that adds composition control by the thermostat if a scenario has setpoints of the share."""
 
     def completed(self, config: DeployConfig, folder: Path | None) -> DeployConfig:
-        """Fill in the composition controller and the vials if a scenario has a composition.
-
-        Simulated vials get the two species of the run.
-        """
+        """Fill in composition controller and vials if a scenario has a composition, and the pair of simulated vials."""
         config = config if folder is None else _with_pair(config, folder)
         pair = read_pair(of_deploy(config).pair)
         if any(map(composed, config.schedules())):
@@ -159,9 +156,7 @@ def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: li
         raise frame.UserError(f"composition={kind}: the vials contain only one species; use {key}")
     one = next(s for s in scenarios if composed(s))
     if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
-        raise frame.UserError(
-            "composition=optimum: the reactors' programs differ; give all the same shares and minutes"
-        )
+        raise frame.UserError("composition=optimum: the programs differ; give all reactors the same shares and minutes")
     policy = composition_policy(kind, two.composition_policy, folder, config.resume is not None)
     program, volumes_ml = program_of(one), config.bench.volumes(config.backend.reactors)
     pair = read_pair(two.pair)

@@ -154,10 +154,7 @@ class Share:
     def _warned(
         self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask
     ) -> list[str | None]:
-        """Return a warning or None for each reactor.
-
-        Args: goal: announced setpoint, else the current one, (N,). inside: whether the target is not at a limit, (N,).
-        """
+        """Return a warning or None per reactor. goal: announced or current setpoint. inside: target within limits."""
         stuck = self._stuck(found["ratio"], np.stack([found["ratio_setpoint"], goal]), inside, minute, believed)
         uncertain = self._uncertain(found, minute, believed)
         hours, c = (minute - self._nearer_min).min(axis=0) / 60.0, found

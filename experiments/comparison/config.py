@@ -34,13 +34,9 @@ class BenchmarkConfig:
     )
     env: EnvConfig = part(EnvConfig, "culture model that model-based controllers and training use")
     agents: dict[str, Any] = setting({}, "learned controllers by name", kinds=agent_schema)
-    train_seeds: int = setting(
-        4, "seeds per agent; the policy that is best on the selection grid is used", within=(1, 1000)
-    )
+    train_seeds: int = setting(4, "seeds per agent; the best policy on the selection grid is used", within=(1, 1000))
     workers: int = setting(
-        0,
-        "processes that run the closed loops; 0: one per core, 1: no extra process. No effect on results",
-        within=(0, 256),
+        0, "processes for the closed loops; 0: one per core, 1: no extra process. No effect on results", within=(0, 256)
     )
     policies: dict[str, str] = setting(
         {},

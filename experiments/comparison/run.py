@@ -84,10 +84,7 @@ def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
 
 
 def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Add the plant of `plant_file`. Its vials start at a random time of the recording, at the OD of the other plants.
-
-    Raises: frame.UserError.
-    """
+    """Add the plant of `plant_file`; its vials start at a random time of the recording. Raises: frame.UserError."""
     if config.plant_file is None:
         return config
     twin = read_plant_file(config.plant_file)

@@ -146,10 +146,9 @@ class Notifier:
 
 
 def opened(target: str, run: Path, resumed: bool) -> Notifier:
-    """Open the notifier that a config's `notify` names.
+    """Open the notifier that a config's `notify` names. Raises: UserError for an unusable receiver.
 
-    Raises: UserError for an unusable receiver. A resumed run only logs this and continues without messages, because a
-      culture waits for it.
+    A resumed run only logs this error and continues without messages, because a culture waits for it.
     """
     try:
         if target.startswith("env:"):

@@ -107,10 +107,7 @@ class Training:
 
 
 def find_policy(name: str) -> Path:
-    """Find a policy.npz. Args: name: path, run folder, `shipped`, or `latest` (newest policy of `train` or `demo`).
-
-    Raises: UserError with allowed values.
-    """
+    """Find a policy.npz. Args: name: path, run folder, `shipped` or `latest` (of train or demo). Raises: UserError."""
     if not name.strip():
         raise messages.NoPolicyNamed()
     if name == "shipped":

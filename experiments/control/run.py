@@ -39,10 +39,7 @@ class BenchMarks:
         self._taken = sum(row["kind"] in ("level", "share", "bottle") for row in record.journal.rows)
 
     def take(self, loop: ClosedLoop) -> None:
-        """Pass the measurements entered since the last call to the loop. A damaged file gives only a warning.
-
-        Raises: RecordingError if the journal cannot be written.
-        """
+        """Pass new measurements to the loop; a damaged file gives a warning. Raises: RecordingError of the journal."""
         path = self._record.folder / NAME
         size = path.stat().st_size if path.is_file() else -1
         if size == self._size:

@@ -139,10 +139,7 @@ def config(kind: str, signal: str = DENSITY) -> Any:
 
 
 def config_at(kind: str, key: str) -> Any:
-    """Return the default config of a controller for a config key: controller, controllers.NAME or signals.NAME.
-
-    Raises: ValueError with the known controllers.
-    """
+    """Return the default config of a controller at a key (controller, controllers.NAME, signals.NAME)."""
     group, _, name = key.partition(".")
     keys = {held.key + s: signal for signal, held in SIGNALS.items() for s in ("", "s") if held.key}
     return config(kind, keys.get(group, name))

@@ -76,9 +76,9 @@ class Progress:
         return bool((changes & (self._announced_min > 0.0)).any())
 
     def following(self, elapsed: Array) -> tuple[Array, Array]:
-        """Return the next setpoint and the minutes until it, (N,) each; the minutes are inf if it is not announced.
+        """Return the next setpoint and the minutes until it, (N,) each; inf if it is not announced.
 
-        The end of a step with a condition is unknown, so it is never announced.
+        The end of a step with a condition is never announced, because it is unknown.
         """
         phase, setpoint, _ = self.asked(elapsed)
         rows, step = np.arange(phase.size), np.maximum(phase, 0)

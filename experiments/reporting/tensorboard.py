@@ -43,9 +43,7 @@ LINE, THREE = (TensorShapeProto(dim=[TensorShapeProto.Dim(size=n)]) for n in (1,
 class Events:
     """Writer of the TensorBoard events of one run; events are visible within seconds.
 
-    Args:
-      folder: folder of the event file.
-      first_step: for a resumed run; TensorBoard hides older events at this step and later.
+    Args: folder: of the event file. first_step: of a resumed run; TensorBoard hides older events from this step on.
     """
 
     def __init__(self, folder: Path, first_step: int = 0) -> None:

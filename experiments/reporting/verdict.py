@@ -48,9 +48,8 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     agents = f"{regret.size} agents" if regret.size > 1 else f"one agent, seed {summary['seeds'][0]},"
     kind = env.get("kind", "density")
     model = f"mu {number(env['mu'])} 1/min, tau {number(env['tau'])}" if "tau" in env else f"the task env={kind}"
-    claim = (
-        f"Training: {agents} trained on {model} for {summary['env_steps']} steps in {summary['train_seconds']:.0f} s."
-    )
+    steps, seconds = summary["env_steps"], summary["train_seconds"]
+    claim = f"Training: {agents} trained on {model} for {steps} steps in {seconds:.0f} s."
     unit = ERROR_UNITS.get(kind, ERROR_UNITS["relative"])
     law = summary["myopic_regret_pct"]
     worst = "of the worst agent " if regret.size > 1 else ""
@@ -121,8 +120,8 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
         f"{summary['n_rejected']} rejected",
     ]
     items += [
-        f"the fit to the first half predicts the second half {a['minutes']:.0f} min ahead with an rms error of "
-        f"{number(a['model_pct'], 2)} % (assuming constant OD: {number(a['od_stays_pct'], 2)} %, constant slope: "
+        f"the first half's fit predicts the second half {a['minutes']:.0f} min ahead with rms error "
+        f"{number(a['model_pct'], 2)} % (constant OD {number(a['od_stays_pct'], 2)} %, constant slope "
         f"{number(a['same_slope_pct'], 2)} %)"
         for a in summary.get("validation", {}).get("ahead", ())
     ]
@@ -139,26 +138,19 @@ def _certificate(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items += [f"{len(failed) - SHOWN} more failed"] * (len(failed) > SHOWN)
     if not failed:
         return Headline(claim, items, "Good: the policy is safe and meets every performance requirement.")
-    said = (
-        "Not safe: devices refuse this policy"
-        if unsafe
-        else "Safe: devices accept this policy. Its performance is insufficient"
-    )
+    said = "Not safe: devices refuse this policy" if unsafe else "Safe: devices accept it, but it performs poorly"
     return Headline(claim, items, f"{said}. Remedy: {REMEDY}.")
 
 
 def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
     inside, doses, twin = summary["inside_pct"], summary["doses_pct"], summary["twin"]
     data = Path(config["data"]).name if config.get("data") else "the shipped recording"
-    claim = (
-        f"Replay of {data}: {number(inside['one'])} % of the readings lay inside the 95 % band predicted one reading "
-    )
-    claim += f"ahead, and {number(inside['ten'])} % inside that predicted {summary['ahead']} readings ahead."
+    claim = f"Replay of {data}: {number(inside['one'])} % of the readings lay in the 95 % band predicted one reading "
+    claim += f"ahead, and {number(inside['ten'])} % in that predicted {summary['ahead']} readings ahead."
     items = [f"{name} {number(low)} to {number(high)}" for name, (low, high) in _spreads(summary)]
     items += [
-        f"doses at setpoint OD {number(summary['setpoint'])}, in % of readings: device and controller "
-        f"{doses['both']:.0f}, neither {doses['neither']:.0f}, only device {doses['device']:.0f}, only controller "
-        f"{doses['controller']:.0f}",
+        f"doses at setpoint OD {number(summary['setpoint'])}, % of readings: both {doses['both']:.0f}, neither "
+        f"{doses['neither']:.0f}, only device {doses['device']:.0f}, only controller {doses['controller']:.0f}",
         f"rejected {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
         "interlock alarms: " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
     ]

@@ -247,7 +247,7 @@ def test_a_signal_without_a_part_is_refused() -> None:
     ("changes", "said"),
     [
         ({"backend": UNIT}, "signals.drug of M0: pump 3, the vendor's alt-media pump, has no tube"),
-        ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug needs the pump 4, .* use one of feed pump"),
+        ({"backend": UNIT, "signals": {"drug": FOURTH}}, "drug needs the pump 4: .* use feed pump"),
         ({"signals": {"drug": FOURTH}}, "signals.drug of M0: Pump4 has no tube"),
         ({"bench": Bench(max_rate=0.005)}, "bench.max_rate = 0.005 mL/s: allowed .* with signals.drug"),
         ({"scenario": replace(HOUR, outputs=("pump3 1 mL",))}, "signals.drug: pump 3 is in scenario.outputs, too"),
@@ -309,7 +309,7 @@ def test_its_preflight_samples_every_vial_and_fails_where_a_pump_runs_on_or_the_
 @pytest.mark.parametrize(
     ("given", "refusal"),
     [
-        (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence, by which"),
+        (["scenario.ratios=[0.5]", "scenario.temperatures=[33]"], "backend=evolver measures no fluorescence"),
         (["scenario.outputs=['pump3 2 mL/h']"], "scenario.outputs: backend=evolver has no spare pump [34]; remove it"),
         (["at_end=regulate"], "at_end = regulate: backend=evolver has no regulation of its own; allowed hold, stop"),
         (["controller=oracle"], "controller=oracle needs the exact state of a simulated plant"),
@@ -402,7 +402,7 @@ def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: py
     [
         (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
         (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
-        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light use the same actuator, thermostat"),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light both use the thermostat"),
     ],
 )
 def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
@@ -424,7 +424,7 @@ def test_names_and_actuators_are_used_once() -> None:
     with pytest.raises(NameTaken):
         signals.add("interlock", light.Light)
     held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
-    with pytest.raises(ValueError, match="light and light use the same"):
+    with pytest.raises(ValueError, match="light and light both use"):
         signals.fitting(held, [THERMOSTAT])
     with pytest.raises(NameTaken):
         agents.add("dqn", type("Other", (), {}), Any, (), "Nothing.")  # type: ignore[arg-type]

@@ -31,8 +31,7 @@ class InverseConfig(ControllerConfig):
 class Inverse:
     """Inverse control u = u_max clip(e + s, 0, 1) with the estimated error e and growth share s, as if both were exact.
 
-    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range, and rounded to the nearest level if `levels` is
-    set.
+    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range and rounded to the nearest level if `levels` > 0.
 
     Args: config: levels, settings of the estimator. model: control period, largest pump rate, initial mu and tau.
     """

@@ -63,10 +63,7 @@ def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) 
 
 
 class LearnedController:
-    """Controller u = actions[argmax_a Q([od, setpoint], a)] (paper, section 3).
-
-    Args: policy: policy that observes OD and setpoint.
-    """
+    """Controller u = actions[argmax_a Q([od, setpoint], a)] (paper, section 3) of a policy with this observation."""
 
     def __init__(self, policy: Policy) -> None:
         self.policy = policy

@@ -125,10 +125,8 @@ class Problem:
         return moves
 
     def value_and_gradient(self, v: Array, scale: float = 1.0) -> tuple[float, Array]:
-        """Return the cost inside the box and its exact gradient, both times `scale`, for a problem with a single row.
-
-        dx_j/dv_k = x_j f'(v_k)/f(v_k) for j >= k, so the gradient is a reversed cumulative sum.
-        """
+        """Return the cost inside the box and its exact gradient, both times `scale`; for a problem with one row."""
+        # dx_j/dv_k = x_j f'(v_k)/f(v_k) for j >= k, so the gradient is a reversed cumulative sum
         f, slope = self.factors(v)
         x = self.start[0] * np.cumprod(f)
         miss = x - self.setpoint[0]

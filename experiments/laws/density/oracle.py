@@ -63,9 +63,7 @@ class Oracle:
     def reset(self, n: int) -> None:
         """Check that the plant has n vials; there is no state to reset. Raises: ValueError."""
         if n != self.plant.n:
-            raise ValueError(
-                f"oracle: {n} reactors, but the plant has {self.plant.n} vials; use {self.plant.n} reactors"
-            )
+            raise ValueError(f"oracle: the plant has {self.plant.n} vials, so it needs as many reactors, not {n}")
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """Return pump rates as `Controller.act`; the argument `od` is not used."""
