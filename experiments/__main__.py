@@ -34,7 +34,7 @@ Exit codes
 
 
 def names() -> list[str]:
-    """Return the names of all commands in the order of the list."""
+    """Return the names of all commands, first those in `KINDS`."""
     listed = [name for group in KINDS.values() for name in group]
     return [*listed, *(name for name in commands() if name not in listed)]
 

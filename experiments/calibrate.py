@@ -1,6 +1,6 @@
 """Fit mu and tau to a recording and write a model file for `train`: `python -m experiments.calibrate`.
 
-`generate=true` simulates a recording of the paper's open-loop protocol instead. `coverage=N` studies the intervals.
+`generate=true` writes a simulated recording instead. `coverage=N` counts how often the intervals contain the truth.
 """
 
 from contextlib import closing
@@ -27,7 +27,7 @@ COLUMNS = ("time_min", "od", "pump_rate_ml_s")
 def body(config: CalibrateConfig, folder: Path) -> float | None:
     """Calibrate, generate a recording, or study the coverage, according to the config.
 
-    Returns: PMSE in % of a calibration. Raises: frame.UserError.
+    Returns: PMSE of a calibration, or coverage of a study, in %. Raises: frame.UserError.
     """
     if config.generate:
         _generate(config, folder)
@@ -79,7 +79,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
 
 
 def _write_twin(path: Path, behind: Twin, source: str) -> str:
-    """Write the plant; return its path, or a message if the recording has values that no plant may have."""
+    """Write the plant; return its path, or a message if a fitted value is out of range for a plant."""
     try:
         text = twin_yaml(behind, source)
     except ValueError as error:

@@ -62,7 +62,7 @@ class CalibratePairConfig:
 
 
 def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfig) -> list[Plateau]:
-    """List the plateaus of a species by temperature. Raises: UserError for a recording without temperatures."""
+    """List the times of a species at one temperature, coldest first. Raises: UserError without temperatures."""
     settle_min = max(config.settle_min, LAGS * lag_min)
     found: list[Plateau] = []
     for path in paths:

@@ -32,7 +32,7 @@ LIMITS = {"feed": 0.05, "waste": 0.5}
 
 @dataclass(frozen=True)
 class Weighing:
-    """One weighing. duty: on-time of each dose over 63 s. doses: number of doses. grams: mass of all doses together."""
+    """One weighing: mass `grams` of `doses` doses together; the pump was on for the fraction `duty` of 63 s in each."""
 
     duty: float
     doses: int
@@ -140,7 +140,7 @@ def report(fit: PumpFit, found: list[Weighing]) -> str:
 
 
 def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
-    """Weigh (or read weighings), fit, store. Raises: UserError."""
+    """Weigh doses or read weighings, then fit and store the calibration. Raises: UserError."""
     with frame.refusing(ReactorError, ValueError):
         if config.csv is not None:
             found, identity = read_weighings(Path(config.csv)), ""

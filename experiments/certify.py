@@ -61,7 +61,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
 
 
 def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> str:
-    """Write the certificate, a copy to `to`, summary, figure and page. Returns: "", or why the copy failed."""
+    """Write certificate, copy at `to`, summary, figure and page. Returns: reason why the copy failed, else ""."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events

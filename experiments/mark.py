@@ -1,7 +1,7 @@
 """Record an event at the bench in a run's folder: `python -m experiments.mark run=RUN text=inoculated`.
 
-The running deployment also uses three marks: it sets its ledger to a level read from the vial, uses a counted share of
-B in its estimate, and continues dosing from a filled bottle.
+A running deployment uses three kinds of marks. It sets its ledger to a level read from the vial, corrects its estimate
+by a counted share of B, and continues to dose from a refilled bottle.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Replay a recording as if it were a run, without acting on it: `python -m experiments.replay data=FILE`."""
+"""Replay a recording as if it were a run, without a device: `python -m experiments.replay data=FILE`."""
 
 import logging
 from collections import Counter
@@ -97,7 +97,7 @@ def _on_twin(
 ) -> tuple[Array, Array, Array]:
     """Simulate the closed loop on the recording's twin; return minutes, true OD and pump rate, (K,) each.
 
-    Raises: ValueError if the recording does not determine tau, or no plant can show this recording.
+    Raises: ValueError if the recording does not determine tau, or if no plant fits the recording.
     """
     plant = plant_of(twin(raw, calibrate(raw, config.identify), config.identify.segment_min))
     vials = SimulatedReactors(Plant(plant, 1, np.random.default_rng(0)), SimulatedConfig(), bench.control_min)

@@ -77,7 +77,7 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
 def refusal(error: NotIdentifiable, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
     """Build the message and the summary.json of a refused calibration.
 
-    A fault of the recording comes first, e.g. a wrong pump.
+    The message names a fault of the recording, e.g. a wrong pump, before any other reason.
     """
     what, then = recording.doubts[0] if recording.doubts else ("", error.remedy)
     verdict = Verdict("record again" if not what else "read again", "; ".join(filter(None, (what, error.why))), then)

@@ -55,7 +55,7 @@ def _setpoint(config: CalibrateConfig, times: Array, t: float) -> float:
 
 
 def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar: bool = False) -> list[Fitted]:
-    """Calibrate each of N recordings, time (T,) and values (N, T); a refused recording gives the message."""
+    """Calibrate each of N recordings, time (T,) and values (N, T); list results, or the message of a refusal."""
     found: list[Fitted] = []
     for i in tqdm(range(len(od)), disable=None if bar else True):
         try:
@@ -84,7 +84,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
 
 
 def coverage(config: CalibrateConfig, folder: Path) -> float:
-    """Return the coverage of 95 % intervals over simulated recordings, in %: that of mu or of tau, the smaller one."""
+    """Simulate recordings; return how many 95 % intervals contain the true value, in %, the smaller of mu and tau."""
     protocol, n = config.protocol, config.coverage
     title = f"{n} simulated recordings of {protocol.hours:g} h under {config.law}, {100 * protocol.noise:g} % noise"
     print(title, flush=True)

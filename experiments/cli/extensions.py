@@ -1,7 +1,7 @@
 """Extensions by a user: Python files by `extend=FILE.py`, presets by `group=FILE.yaml`.
 
 A Python file registers its extensions (docs/extending.md) when it is loaded. The environment variable
-`TURBIDOSTAT_EXTEND` lists the files for every process and cluster job. `resume=RUN` loads the run folder's copy.
+`TURBIDOSTAT_EXTEND` lists the files for all processes. The run folder keeps copies, which `resume=RUN` loads.
 """
 
 import importlib.util

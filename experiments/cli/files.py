@@ -47,7 +47,7 @@ def given(folder: Path) -> list[str]:
 
 
 def choices(folder: Path) -> dict[str, str]:
-    """Map each group to its preset for a run folder; omit groups without a preset; {} if unknown."""
+    """Return the preset of each group that a run folder's run had chosen, group -> preset; {} if unknown."""
     path = folder / ".hydra" / "hydra.yaml"
     block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
     pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))

@@ -103,15 +103,15 @@ def _leaves(config: Any) -> Iterator[str]:
 
 
 def _parts(name: str, config: Any) -> dict[str, Any]:
-    """Map the groups and parts of a command by name to parts of its config; None for a group that is no part."""
+    """Return name -> part of the config for every group and part of a command; None for a group without a part."""
     return dict.fromkeys(chosen(name)) | {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
 
 
 def text(name: str, config: Any, about: str = "") -> str:
     """Return the text of `--help`, with the values that the rest of the command line gives.
 
-    Args: name: name of the command. config: its config. about: "all", or one group or part of the config; "" for the
-      short page.
+    Args: name: name of the command. config: its config. about: "all" or a group or part of the config, whose values
+      are listed; "" for the short page.
     Raises: ValueError for an unknown `about`.
     """
     if not about:

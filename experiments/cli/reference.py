@@ -81,7 +81,7 @@ def _variants(command: EntryPoint[Any]) -> Iterator[Any]:
 
 
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
-    """Collect the class of every part below a config, with the name under which it comes first."""
+    """Add the class of every part below a config to `parts`, with the first name of this class."""
     for entry in entries(config):
         values, name = [entry.value], entry.name
         if isinstance(entry.value, dict):

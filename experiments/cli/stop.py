@@ -77,7 +77,7 @@ def _interrupt(number: int, stack: FrameType | None) -> None:
     """Raise a stop, and raise it again every `AGAIN_S` until it is handled.
 
     A handler runs between two steps of any Python code. If C code called this Python code, the C code may swallow the
-    exception: an enum runs Python when NumPy looks up `__array_ufunc__`, and NumPy takes any error as "no attribute".
+    exception. For example, when NumPy looks up an attribute of an operand, it takes any error as "no such attribute".
     """
     if _Wait.asked:
         _Wait.came = number
@@ -172,7 +172,7 @@ class Pause:
         return bool(self._came)
 
     def answer(self, number: int, stack: FrameType | None) -> None:
-        """Handle a signal. A second one from the user ends the program at once, but not one of a cluster's own signals.
+        """Handle a signal. A second stop by the user ends the program at once; a second signal of a cluster does not.
 
         A second signal does not end a worker, because a worker gets each stop twice: from terminal and command.
         """
@@ -200,7 +200,7 @@ class Pause:
 
 @contextmanager
 def pausing(until: str) -> Iterator[Pause]:
-    """Let the first signal only set the yielded pause; a second one from the user ends the program at once.
+    """Let the first signal only set the yielded pause. A second stop by the user ends the program at once.
 
     Use this context only for work that can be saved between two steps. Args: as of `Pause`.
     """
@@ -223,7 +223,7 @@ def _begin_worker() -> None:
 
 
 class Workers(ProcessPoolExecutor):
-    """Pool of worker processes that leave terminal signals to the command; an exception in the context ends them.
+    """Pool of worker processes that leave terminal signals to the command. An exception in the context ends the pool.
 
     The workers are spawned, because a fork would copy torch's threads in an arbitrary state.
     Args: count: number of processes; 0 for one per core.

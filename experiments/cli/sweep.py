@@ -76,7 +76,7 @@ def read(folder: Path) -> Sweep | None:
 def asked(given: Sequence[str], command: str) -> Sweep | None:
     """Return the sweep of a command line, None for a single run.
 
-    `resume=SWEEP` continues the sweep in this folder; the launcher may be a new one.
+    `resume=SWEEP` continues the sweep in that folder, perhaps with another launcher.
     Raises: UserError if other arguments are given, too.
     """
     plain = [a for a in given if a not in FLAGS]
@@ -180,7 +180,7 @@ class Job:
 def working(folder: Path, wait: bool = False) -> Iterator[None]:
     """Exclude other processes from the job of a folder in this context.
 
-    Args: wait: whether to wait until another process ends. Raises: Busy, without waiting, if another process works.
+    Args: wait: whether to wait for another process. Raises: Busy if another process has the job and `wait` is false.
     """
     with open(folder / ".lock", "w") as lock:
         try:

@@ -82,7 +82,7 @@ def _config(run: Path) -> Mapping[str, Any]:
 def decisions(run: Path, reactor: str) -> dict[str, Array]:
     """Read the K decisions for a reactor from the journal: `minute`, `supervised` and the controller's estimates, (K,).
 
-    A value is nan for a decision without this key. A key that no decision has is omitted.
+    The value of a decision without a key is nan. A key that no decision has is omitted.
     """
     rows = list(_decisions(run / "journal.jsonl", reactor))
     known = [key for name in ESTIMATED for key in (name, f"{name}_sd", f"true_{name}")]
@@ -187,7 +187,7 @@ def _fact(c: Compared) -> str:
 
 
 def _sure(why: Mapping[str, Array]) -> list[str]:
-    """List how often each estimate was within two of its standard deviations of the truth, where that is known."""
+    """List how often each estimate was within two of its standard deviations of the truth, in a simulation."""
     names = {"error": "error e", "growth_share": "growth share s"}
     found = {key: values[np.isfinite(values)] for key, values in within_2sd(why).items()}
     within = "within two standard deviations of the truth in"

@@ -44,7 +44,7 @@ class Recordings:
     marks: Sequence[Mark]
 
     def od(self, refused: bool = False) -> Array:
-        """Return the OD, (N, K), nan where the interlock rejected it; if `refused`, nan where it accepted it."""
+        """Return the OD, (N, K), of readings that the interlock accepted, or (`refused`) rejected; nan elsewhere."""
         return np.where((self.columns["believed"] == 0.0) == refused, self.columns["od"], np.nan)
 
     def setpoints(self) -> Array:

@@ -76,7 +76,7 @@ class Rows:
     """All rows of one reactor's recording: numbers by column, and alarms of the interlock.
 
     Args: columns: names of the recording's columns: `COLUMNS`, perhaps followed by others.
-    Attributes: names: of the columns. columns: name -> numbers. alarms: number of rows with alarms. reasons: by kind.
+    Attributes: names: of columns. columns: name -> numbers. alarms: number of rows with alarms. reasons: by kind.
     """
 
     def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
@@ -141,7 +141,7 @@ def complete(
 
 
 def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
-    """Return the volume fed by each decision for a reactor, number of its journal row -> mL, oldest first.
+    """Return the volume fed by each decision for a reactor: number of the decision's journal row -> mL, oldest first.
 
     A dose belongs to the decision before it. A repeated dose belongs to the decision after it, or to the last decision
     if the program ended (row `closed`) before another one. Raises: RecordingError.
@@ -160,8 +160,8 @@ def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]
 def at_end(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
     """Return the corrected last row of reactor `name` if its dose was cut short or repeated later, else None.
 
-    Args: journal: rows up to the end of this start of the program, with a row `closed`. rows: the written rows, with
-      the dose as planned. Raises: RecordingError.
+    Args: journal: rows up to the present, the last one `closed`. rows: the written rows, with the planned dose.
+    Raises: RecordingError.
     """
     decisions = [r for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
     if not decisions or not len(rows) or rows.last()["time_min"] != decisions[-1]["row"]["time_min"]:

@@ -31,7 +31,7 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 class ChangeLog:
-    """Logger of changes: phases, interlock alarms, policy or supervisor. It repeats notes of reactors once an hour.
+    """Logger of changes: phases, interlock alarms, hand-overs. It logs the notes of reactors at most once an hour.
 
     Args: loop: loop to watch. tell: function of event, text and reactor, also called for alarms and hand-overs.
     """
@@ -81,7 +81,7 @@ class ChangeLog:
         self.notes(step.now_s, step.notes)
 
     def notes(self, now_s: float, notes: Sequence[str]) -> None:
-        """Log notes; repeat a note, with new numbers or not, after an hour or when its largest number has doubled."""
+        """Log notes; repeat a note only after an hour or when its largest number has doubled. Numbers may differ."""
         for note in notes:
             kind, largest = NUMBER.sub("#", note), max(map(float, NUMBER.findall(note)), default=0.0)
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))
@@ -147,7 +147,7 @@ def summarise(
 
 
 def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
-    """Return the metrics of every phase of every reactor; `ended` is what ended the phase, null for an open phase."""
+    """Return the metrics of every phase of every reactor; `ended` is the reason of the phase's end, or null."""
     elapsed, od = table.columns["elapsed_min"], table.od()
     rows = []
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
@@ -165,9 +165,9 @@ def _windows(table: Recordings, scenarios: Sequence[Scenario], progress: Progres
 
 
 def _further(table: Recordings, n: int, start: float, end: float) -> dict[str, Any]:
-    """Return the errors of reactor n's OD and further signals, by the estimate and, where known, by the truth.
+    """Return the errors of reactor n's OD and further signals: of the estimate, and of the true value if known.
 
-    A signal has the columns NAME, NAME_setpoint and perhaps true_NAME. Its setpoint is None unless it was constant.
+    A signal has the columns NAME, NAME_setpoint and perhaps true_NAME. A setpoint that changed is None.
     """
     own = {key: values[n : n + 1] for key, values in table.columns.items()}
     minute = own["elapsed_min"]

@@ -69,7 +69,7 @@ class Layout:
 
     @property
     def numbers(self) -> list[int]:
-        """Columns of numbers, each once."""
+        """Numbers of all columns to read as floats, each listed once."""
         some = [self.time, self.od, *self.fed, *self.idle.values(), *self.light, self.temperature]
         return [place for place in dict.fromkeys(some) if place is not None]
 
@@ -77,8 +77,8 @@ class Layout:
 def recognised(path: Path, first: Sequence[str], named: bool, asked: Asked, doses: bool, alone: bool) -> Layout:
     """Recognise the columns from the first line.
 
-    Args: named: whether this line has names. doses: whether the file is a table of doses for another file.
-      alone: whether the file has no such table. Raises: RecordingError with the columns looked for and found.
+    Args: named: whether this line has names. doses: whether the file is a table of doses for a file of readings.
+      alone: whether there is no table of doses. Raises: RecordingError with the columns looked for and found.
     """
     if first[0].startswith(EVOLVER):
         if alone:

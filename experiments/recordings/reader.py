@@ -48,7 +48,7 @@ class Recording:
     temperature: degC, nan without a reading, shape (n,).
     row: number of each row in the file, counting data rows from 0, shape (n,).
     notes: sentences on what was excluded, assumed or repaired.
-    doubts: (likely fault that makes mu and tau wrong, its remedy), each.
+    doubts: pairs of a fault that probably makes mu and tau wrong, and its remedy.
     source: name of the recognised layout.
     runs: numbers of the first and last row of every run in the file.
     fluorescence: counts, nan without a reading, shape (n,).
@@ -78,7 +78,7 @@ def read_recording(
     columns: Mapping[str, str] = MappingProxyType({}),
     time_unit: str | None = None,
 ) -> Recording:
-    """Read a recording from a device's own file, from `Recorder`'s, or from a table.
+    """Read a recording from a device's own file, from a file of `Recorder`, or from a table.
 
     docs/calibration.md has the layouts. In a file with doses a row is a reading, a dose or both, and blank cells are
     allowed. A dose changes the next reading.
@@ -146,7 +146,7 @@ def _with_times_and_rates(path: Path, table: Cells, notes: list[str]) -> Cells:
 
 
 def _idle_pumps(layout: Layout, table: Cells, pumps: Sequence[int], notes: list[str]) -> Doubts:
-    """Return a doubt if a pump ran that is not counted; a waste pump that moved as much as all others is no doubt."""
+    """Return a doubt if a pump ran that is not counted, except a waste pump that moved as much as the others."""
     fed = float(np.nansum(table.pump_rate))
     moved = {pump: abs(float(np.nansum(rate))) for pump, rate in zip(layout.idle, table.idle.T, strict=True)}
     ran = [pump for pump, rate in zip(layout.idle, table.idle.T, strict=True) if (np.abs(rate) > 0.0).any()]

@@ -100,8 +100,8 @@ def _loaded(
 class _Read(NamedTuple):
     """Content of n rows. column: number of the column -> its numbers, (n,). width: number of cells of each row, (n,).
 
-    label: reactor, experiment, channel or event -> index of each row's text in `names`, (n,), -1 for a row too short.
-    names: reactor, ... -> all its texts. headers: numbers of the rows before which the header is repeated.
+    label: key (reactor, experiment, channel or event) -> index in `names` of each row's text, -1 if cut off, (n,).
+    names: key -> its texts. headers: numbers of the rows before which the header is repeated.
     """
 
     column: dict[int, Array]
@@ -191,7 +191,7 @@ def _in_house_units(path: Path, layout: Layout, read: _Read, keep: Mask, notes: 
 
 
 def _given(path: Path, total: Array, cells: Cells) -> Array:
-    """Return doses, (n,), from running totals, (columns, n); a blank cell repeats the total. Raises: RecordingError."""
+    """Return the doses, (n,), from running totals, (columns, n). A blank cell is no dose. Raises: RecordingError."""
     at = np.maximum.accumulate(np.where(np.isfinite(total), np.arange(total.shape[1]), 0), axis=1)
     filled = np.nan_to_num(np.take_along_axis(total, at, axis=1))
     given = np.diff(filled, axis=1, prepend=filled[:, :1]).sum(axis=0)
@@ -205,7 +205,7 @@ def _given(path: Path, total: Array, cells: Cells) -> Array:
 
 
 def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, notes: list[str]) -> tuple[Array, Array]:
-    """Read a table of doses; return minutes as for the readings, and mL, in order of time. Raises: RecordingError."""
+    """Read a table of doses; return minutes on the readings' clock, and mL, by time. Raises: RecordingError."""
     layout, read = _loaded(path, text.DOSED, asked._replace(time_unit=None), notes, doses=True)
     keep = np.ones(len(read.width), dtype=np.bool_)
     if reactor is not None and "reactor" in layout.labels:
@@ -270,7 +270,7 @@ def _check_doses(path: Path, dose: Array) -> None:
 
 
 def _minutes(path: Path, layout: Layout, time: Array, notes: list[str]) -> tuple[Array, bool]:
-    """Return times in min, nan for a time of another kind than most, and whether they count from 1970."""
+    """Return the times in min, and whether they count from 1970; a time that does not fit the others becomes nan."""
     known = time[np.isfinite(time)]
     middle = float(np.median(known)) if len(known) else 0.0
     for floor, per_minute, words in EPOCHS:

@@ -53,7 +53,7 @@ def _members(path: Path, names: Sequence[str], tables: Sequence[str]) -> list[st
 
 
 def _texts(path: Path, tables: Sequence[str]) -> Iterator[io.TextIOWrapper]:
-    """Yield the open texts of a file. Args: tables: names of tables; of an export, the first one found is read."""
+    """Yield the open texts of a file. Args: tables: of an export, the first of these tables that exists is read."""
     if zipped(path):
         with zipfile.ZipFile(path) as archive:
             for name in _members(path, archive.namelist(), tables):
@@ -114,7 +114,7 @@ def cells(path: Path, tables: Sequence[str], notes: list[str]) -> Iterator[list[
 
 
 def number(cell: str) -> float:
-    """Return the number in a cell, or s since 1970 for a date (ISO 8601, UTC without a time zone), else nan."""
+    """Return the number in a cell, s since 1970 for a date (ISO 8601, in UTC if it has no time zone), else nan."""
     try:
         return float(cell)
     except ValueError:

@@ -69,7 +69,7 @@ class Replayed:
 
     @property
     def doses(self) -> dict[str, float]:
-        """Per cent of readings after which device and controller both dose, neither doses, or only one of them does."""
+        """Per cent of readings after which both device and controller dose, neither does, or only one of them does."""
         ours, theirs = self.decided_ml[:-1] > 0.0, self.given_ml[:-1] > 0.0  # the last reading has no dose after it
         each = {
             "both": ours & theirs,

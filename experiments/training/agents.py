@@ -71,7 +71,7 @@ def add(
 
 
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
-    """Make as many agents as each stream has seeds.
+    """Make S agents, one for each seed of a stream.
 
     Raises: ValueError if the config does not fit the task, or if the agent lacks an attribute of `Agent`.
     """

@@ -157,7 +157,7 @@ class Preview(DensityTask):
         return self._changes(np.unique(self.config.setpoints))
 
     def _changes(self, setpoints: Array) -> Array:
-        """Return starts at rest at one setpoint when the change to another is announced, (G, 4)."""
+        """Return starts of cultures at rest at a setpoint, at the time when a change is announced, (G, 4)."""
         now, following = (a.ravel() for a in np.meshgrid(setpoints, setpoints, indexing="ij"))
         differ = now != following
         time = np.full(int(differ.sum()), self.config.preview_min)

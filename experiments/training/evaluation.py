@@ -25,7 +25,7 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score of S agents. cost: J, (S,). regret_pct: cost above the optimum's, in per cent of it, (S,).
+    """Score of S agents. cost: J, (S,). regret_pct: cost above the optimum's cost, per cent, (S,).
 
     steady_by_setpoint: steady error at each of M setpoints (values of `asked`), (S, M).
     mean_abs_error: mean |error| over all steps and starts, (S,).
@@ -69,15 +69,15 @@ def pairs(first: Array, second: Array) -> Array:
 
 
 def each(policy: Policy) -> Act:
-    """Return a policy file as the only policy (S = 1) of a rollout."""
+    """Return a policy file as a function for `rollout`, with S = 1."""
     return lambda observation: policy.act(observation[0])[None]
 
 
 def beside_optimum(policy: Policy, task: Any, start: Array) -> tuple[Array, Array, Array, Array]:
     """Run a policy file and the optimum from starts (G, O).
 
-    Returns: first numbers observed by the policy and by the optimum, with the start, (K + 1, G) each; their action
-      values, (K, G) each.
+    Returns: first observed number under the policy and under the optimum, from the start on, (K + 1, G) each; action
+      values of the policy and of the optimum, (K, G) each.
     """
     runs = rollout(each(policy), task, start[None]), task.best(start)
     ours, theirs = (np.concatenate([start[:, 0][None], run.state[:, 0]]) for run in runs)

@@ -57,7 +57,7 @@ class Relative:
         return self._grid(41, 48, 0.5)
 
     def _grid(self, errors: int, shares: int, place: float) -> Array:
-        """Return one point in each of equal cells, at `place` (0 to 1), so that two grids share no point."""
+        """Return a point in each cell of a grid, at the fraction `place` of the cell. Two grids then share no point."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         e = span * (2.0 * (np.arange(errors) + place) / errors - 1.0)
         return pairs(e, low + (high - low) * (np.arange(shares) + place) / shares)

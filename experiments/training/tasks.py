@@ -49,7 +49,7 @@ class Task(Evaluated, Protocol):
         """Return one copy of the environment per seed."""
 
     def hindsight(self, agent: DQNConfig) -> Relabel:
-        """Return the object that gives replayed transitions new goals."""
+        """Return the relabelling that gives replayed transitions new goals."""
 
     def selection_grid(self) -> Array:
         """Return the starts, (G, O), for the comparison of policies during training."""

@@ -1,4 +1,4 @@
-"""Example of a third fluid: a drug from a spare pump holds the growth rate, even of a culture that gets used to it."""
+"""Example of a third fluid: a spare pump's drug holds the growth rate, even if the culture gets used to the drug."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
