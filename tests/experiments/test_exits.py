@@ -126,7 +126,7 @@ def test_signal_after_signal_does_not_end_it_before_the_pumps_are_off(bench: Ben
     assert "Traceback" not in said
     assert bench.motors() == []
     bench.check("stopped by the operator")
-    assert status in (0, 130, -signal.SIGINT)  # the last one may fall into the end of the interpreter
+    assert status in (0, 130, -signal.SIGINT), said  # the last one may fall into the end of the interpreter
 
 
 @pytest.mark.slow
