@@ -21,8 +21,7 @@ class Logbook:
 
     Args: log: takes a row; must never raise (see `hardware.stations`). write: takes a row that must be on the disk
       before its action begins, e.g. an intent; may raise. elapsed: returns the run time, s.
-    Attributes: fault: current fault or None. news: the fault's kind has changed since the last measurement. notes:
-      notes for the next receipt.
+    Attributes: fault: current fault, or None. news: its kind changed after the last measurement. notes: for a receipt.
     """
 
     def __init__(self, name: str, log: Log, write: Log, elapsed: Callable[[], float]) -> None:

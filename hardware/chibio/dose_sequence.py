@@ -256,7 +256,7 @@ class DoseSequence:
             self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
 
     def _look_first(self) -> None:
-        """Read the pumps before they are switched off. Raises: as `read`, if an answer is missing or a dose open."""
+        """Read the pumps before they are switched off; a failed read is an error after a missing answer or a resume."""
         left = self._past().open and not self.running
         seen_s = self._past().seen_s if left else self._doubt_s
         try:

@@ -18,8 +18,8 @@ class ExperimentGone(any_kind.RestartedFault,
     remedy="the program restores blank and targets and starts the experiment; check the board's power"):
     """The device was restarted or lost power."""
 class EndedByUs(any_kind.StoppedFault, says="this program ended the experiment: {why}",
-    remedy="the program tries to start it every minute"):
-    """Pumps did not stop, or no sample came."""
+    remedy="the program starts it again"):
+    """Pumps did not stop, or no sample came. The program tries a start every minute."""
 class EndedBySomebody(any_kind.StoppedFault, says="someone stopped the experiment",
     remedy="start it in the device's web page, then close the page"): ...
 class NotTakenOver(any_kind.StoppedFault, says="this reactor could not be started: {error}",

@@ -26,8 +26,7 @@ class ReactorHistory(History):
     an open dose. feed_s, waste_s: planned on-times, s. feed_pump: pump that feeds. experiment: start_time when the dose
     began. feed_on, waste_on, feed_off, waste_off: run times between which this pump went on or off, from the answer to
     its command or from a read; nan if unknown. feed_tried, waste_tried: run time of the first off command that failed.
-    feed_anew, waste_anew: run time since which somebody else may have switched the pump on, and its on-time then; nan
-    if nobody did.
+    feed_anew, waste_anew: run time since which somebody else may have switched the pump on, and its on-time, or nan.
     """
 
     device_id: str = ""

@@ -21,7 +21,7 @@ HARDWARE = -1  # `life` of events that continue without the software
 
 
 class AppError(Exception):
-    """An exception inside the device's software: a route answers 500, a thread ends."""
+    """An exception inside the device's software: the route answers 500, or the thread ends."""
 
 
 class BusStuck(Exception):

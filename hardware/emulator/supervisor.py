@@ -106,7 +106,7 @@ class Supervisor:
         yield from ()
 
     def exit(self) -> None:
-        """End gunicorn, as exit code 4 of a worker does: no more requests are accepted."""
+        """End gunicorn, as it ends when a worker exits with code 4: no more requests are accepted."""
         self._end_process()
         self.alive = False
         self.exits += 1

@@ -15,7 +15,7 @@ from hardware.pioreactor.messages import MessageIgnored, OtherClient
 
 KEPT, LONGEST = 2000, 100_000  # most readings and events; most bytes of a message
 MOST_ML = 100.0  # an event reports less: half a second of a pump, or the volume of a job that stood still
-LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
+LOCKS = "turbidostat/lock/"  # retained topics of the clients that control units; the last will clears them
 PUMPS = MEDIA, ALT, WASTE = "add_media", "add_alt_media", "remove_waste"  # jobs, in the order of config.pump_pins
 NAMES = {MEDIA: "media", ALT: "alt_media", WASTE: "waste"}  # as the vendor wires and calibrates them
 SPARE = 3  # number of the alt-media pump

@@ -262,7 +262,7 @@ class PioreactorStation(Station):
             self._listed.discard(HEAT)
 
     def pumps_off(self, real_s: float = PUMPS_S, final: bool = False) -> Iterator[float]:
-        """Switch every pump off, verified; end a dose, but its waste only if final. Raises: DeviceStateError."""
+        """Switch every pump off, verified. A dose ends; its waste still runs unless final. Raises: DeviceStateError."""
         deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
         pumps.barred = PUMPS if final else (MEDIA, ALT)
         try:

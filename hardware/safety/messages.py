@@ -16,7 +16,7 @@ class FallsPause(FallsFault, says="no dose for another {minutes:.1f} min after t
 class OverflowFault(Fault, says="room for {left_ml:.2f} mL in the vial, {asked_ml:.2f} mL requested",
     remedy="check waste pump and tube; mark the level: python -m experiments.mark run=RUN reactor=NAME level_ml=ML",
     response="pumps_off"):
-    """According to the run's ledger the vial is too full."""
+    """By the run's ledger the vial is too full."""
 class NoDilutionFault(Fault, says="ln OD is {above:.2f} too high: some or all of the last {doubt_ml:.1f} mL was air",
     remedy="check bottle, feed tube and gasket (after filling the bottle, mark bottle_ml=ML); clean the vial's wall",
     response="hold"):
@@ -32,7 +32,7 @@ class DosesNotTaken(UndosedFault, says="{owed_ml:.2f} mL were allowed, nothing w
     """The device gave none of the allowed doses: the link is too slow, or its settings were changed."""
 class BottleFault(Fault, says="{left_ml:.2f} mL left in the bottle, {asked_ml:.2f} mL requested",
     remedy="fill the bottle, then: python -m experiments.mark run=RUN reactor=NAME bottle_ml=ML", response="hold"):
-    """According to the run's ledger the bottle is empty. No dose until you mark the bottle as filled."""
+    """By the run's ledger the bottle is empty. No dose until you mark the bottle as filled."""
 class BudgetFault(Fault, says="{left_ml:.2f} mL left of the feed budget, {asked_ml:.2f} mL requested",
     remedy="check for a leak or wash-out; if the flow is right, start a run with more safety.ml_per_hour or ml_per_run",
     response="hold"):

@@ -20,8 +20,8 @@ MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples
 class Finding:
     """A fault, and the rows of the reactors that have it, shape (N,).
 
-    seen: values for the fault's sentence, each one for all reactors or of shape (N,). cool: reactors that get a pause
-    without doses, unless the fault is only reported; None: no reactor.
+    seen: values for the fault's sentence, each a scalar or of shape (N,). cool: reactors that get a pause without
+    doses, unless the fault is only reported; None: no reactor.
     """
 
     fault: type[Fault]

@@ -71,7 +71,7 @@ class WatchedChiBio(Watched):
         return True, None
 
     def _fed_ml(self, data: dict[str, Any], state: DeviceState) -> float:
-        """Return the volume commanded since the last sample: a record's duty acts until the next record."""
+        """Return the volume commanded since the last sample; the duty of a record is valid until the next record."""
         times, duties = (data[key].get("record", []) for key in ("time", FEED))
         n = min(len(times), len(duties))
         time, duty = np.array(times[len(times) - n :], dtype=float), np.array(duties[len(duties) - n :], dtype=float)
