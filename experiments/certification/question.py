@@ -10,7 +10,7 @@ from conf.schema import build
 from dqn.policy import ABSOLUTE, RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig
+from experiments.certification.config import LIMITS, CertifyConfig, Limits
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.polygons import Array
 
@@ -34,7 +34,7 @@ class Question:
     of the policy. reached: fraction of the band that trajectories must reach, with exact estimates and with errors;
     None for a policy of the OD, whose band may contain gaps between several resting places.
     unit: unit of half-widths. what: second coordinate, of which strips are ranges. setpoints: lowest and highest, OD.
-    drawn: cases in the figure. bounds: on the errors of the estimator, None without an estimator.
+    drawn: cases in the figure. limits: of the requirements. bounds: on the errors of the estimator, None without an estimator.
     median: safety limit of the median excess over the strips of the nominal case; None: no limit.
     """
 
@@ -49,6 +49,7 @@ class Question:
     what: str
     setpoints: tuple[float, float]
     drawn: tuple[str, ...]
+    limits: Limits
     bounds: EstimateBounds | None = None
     median: float | None = None
 
@@ -99,7 +100,7 @@ def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
 
 
 def _of_od(policy: Policy, config: CertifyConfig) -> Question:
-    model, limits = model_of(policy, config), config.limits
+    model, limits = model_of(policy, config), LIMITS
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))
     if not low < high:
@@ -119,14 +120,14 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
     highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # highest start over a strip
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
     return Question(
-        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins),
+        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins), limits,
         median=limits.safe_excess_median,
     )  # fmt: skip
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
     """Build the question of a policy that sees (error, growth share)."""
-    model, limits, (low, high) = model_of(policy, config), config.limits, config.growth_shares
+    model, limits, (low, high) = model_of(policy, config), LIMITS, config.growth_shares
     clip = (np.asarray(policy.low, dtype=np.float64), np.asarray(policy.high, dtype=np.float64))
     if not clip[0][1] - BEYOND <= low < high <= clip[1][1] + BEYOND:
         raise CertificationError(
@@ -137,7 +138,7 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     middle = float(np.round((lowest + highest) / 2.0, 3))
     at_setpoints = sorted({lowest, middle, highest} if setpoints is None else set(setpoints))
     off = EstimateBounds(full, config.error, config.error_od, config.error_share, 0.0, (low, high), (lowest, highest))
-    watched = replace(off, od=config.watched_od, growth_share=config.watched_share)
+    watched = replace(off, od=limits.watched_od, growth_share=limits.watched_share)
     cases = [ShareCase("nominal", replace(off, error=0.0, od=0.0, growth_share=0.0)), ShareCase("errors", off)]
     for b in sorted({round(b, 9) for b in (full, *(() if config.quick else config.full_pumps))}):
         own = replace(off, full_pump=b)
@@ -160,7 +161,7 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     reached = limits.reached_nominal, limits.reached
     what = "periods of full pump", "growth share"
     return Question(
-        loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched
+        loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), limits, watched
     )
 
 
