@@ -15,8 +15,8 @@ class Limits:
     """Limits of the requirements; docs/certificate.md has values of good and bad policies.
 
     Limits whose names begin with `safe_` are safety limits: a device refuses a policy that exceeds such a limit. The
-    others are performance limits: a device reports that a policy exceeds them, and runs it. Limits of the half-width are
-    limits of the part beyond the one-line controller's.
+    others are performance limits: a device reports that a policy exceeds them, and runs it. Limits of the half-width
+    are limits of the part beyond the one-line controller's.
 
     excess, excess_uncertain: half-width, OD: nominal model without noise; with noise and uncertainty.
     excess_nominal, excess_share: half-width of a policy of (error, growth share), periods of full pump: exact

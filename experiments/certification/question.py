@@ -34,7 +34,7 @@ class Question:
     of the policy. reached: fraction of the band that trajectories must reach, with exact estimates and with errors;
     None for a policy of the OD, whose band may contain gaps between several resting places.
     unit: unit of half-widths. what: second coordinate, of which strips are ranges. setpoints: lowest and highest, OD.
-    drawn: cases in the figure. limits: of the requirements. bounds: on the errors of the estimator, None without an estimator.
+    drawn: cases in the figure. limits: of the requirements. bounds: on the errors of the estimator, None without one.
     median: safety limit of the median excess over the strips of the nominal case; None: no limit.
     """
 

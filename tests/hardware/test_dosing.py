@@ -230,11 +230,7 @@ def test_a_blank_that_is_none_names_its_reactor(tmp_path: Path, content: str, wo
     ("config", "values", "words"),
     [
         (SupplyConfig, {"pump4_ml_s": 0.19}, "backend.supply.pump4_ml_s = 0.19: allowed 0 or 0.2 to 1.5 mL/s"),
-        (
-            SupplyConfig,
-            {"pump3_ml_s": 1.5, "bias_s": 0.1},
-            "pump3_ml_s = 1.5: allowed a flow that gives at most 0.5 mL",
-        ),
+        (SupplyConfig, {"pump3_ml_s": 1.5, "bias_s": 0.1}, "pump3_ml_s = 1.5: allowed .* at most 0.5 mL"),
         (SupplyConfig, {"pump3_ml_s": 1.5, "bias_s": 0.03}, None),
         (SupplyConfig, {"pump4_ml_s": 0.2}, None),
         (ChiBioConfig, {"stale_s": 180.0}, "backend.lost_s = 180.0 s: allowed more than stale_s = 180.0 s"),
