@@ -81,7 +81,6 @@ class CertifyConfig:
     setpoints: tuple[float, float] | None = setting(
         None, "range of setpoints; null: the range of the training", "OD", above=0.0, at_most=4.0, interval=True
     )
-    strip: float = setting(0.005, "width of the strips of setpoints, or growth shares", within=(1e-4, 0.1))
     growth_shares: tuple[float, float] = setting(
         (0.05, 0.97), "range of mu h / B, for a policy of (error, growth share)", within=(0, 1), interval=True
     )
@@ -107,7 +106,6 @@ class CertifyConfig:
         """List the values that make the proof of safety less strict than the defaults."""
         usual = CertifyConfig()
         named = [(n, own, by) for n in ASKED if (own := getattr(self, n)) < (by := getattr(usual, n))]
-        named += [("strip", self.strip, usual.strip)] if self.strip > usual.strip else []
         for name in ("start_od", "growth_shares"):
             own, by = getattr(self, name), getattr(usual, name)
             named += [(name, list(own), list(by))] if own[0] > by[0] or own[1] < by[1] else []

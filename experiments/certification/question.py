@@ -14,6 +14,7 @@ from experiments.certification.config import LIMITS, CertifyConfig, Limits
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.polygons import Array
 
+STRIP = 0.005  # largest width of the strips of setpoints, OD, or of growth shares
 BEYOND = 1e-6  # margin around the required range
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
 
@@ -94,8 +95,8 @@ def full_pump(model: EnvConfig) -> float:
     return model.max_pump_rate * model.control_min / model.tau
 
 
-def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
-    edges = np.linspace(low, high, max(1, int(np.ceil((high - low) / width - 1e-9))) + 1)
+def _strips(low: float, high: float) -> tuple[Array, Array]:
+    edges = np.linspace(low, high, max(1, int(np.ceil((high - low) / STRIP - 1e-9))) + 1)
     return edges[:-1], edges[1:]
 
 
@@ -107,7 +108,7 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
         raise CertificationError(f"setpoints {low:g} to {high:g}: allowed low < high; set setpoints=[LOW,HIGH]")
     if not (np.isneginf(policy.low) & np.isposinf(policy.high)).all():
         raise CertificationError("it clips OD or setpoint, which the proof does not cover; export it without limits")
-    strips = _strips(low, high, config.strip)
+    strips = _strips(low, high)
     loop = OdLoop(model.mu, model.tau, model.control_min, actions(policy), config.start_od, *strips)
     cases = (
         OdCase("nominal", 0.0, 0.0),
@@ -155,7 +156,7 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     late = {case.name: limits.late_slow if case.slow else limits.late for case in cases}
     margins = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
     judged = dict.fromkeys(margins, limits.safe_excess_share)
-    loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
+    loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high), clip)
     seen = loop.seen(cases[-1])
     box = ((float(clip[0][0]), float(clip[1][0])), (float(seen[0].min()), float(seen[1].max())))
     reached = limits.reached_nominal, limits.reached

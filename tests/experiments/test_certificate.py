@@ -574,12 +574,12 @@ def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
 
 ATTACKED_BY_LESS = {
     "start_od": [(0.1, 1.5), (0.05, 1.2)], "growth_shares": [(0.3, 0.98), (0.04, 0.5)],
-    "strip": [0.006], "uncertainty": [0.2], "noise": [0.01], "error": [0.0], "error_od": [0.004],
+    "uncertainty": [0.2], "noise": [0.01], "error": [0.0], "error_od": [0.004],
     "error_share": [0.04], "error_gain": [0.1],
 }  # fmt: skip
 """Settings by which less is asked of safety."""
 MORE = replace(
-    CertifyConfig(), start_od=(0.01, 2.0), growth_shares=(0.04, 0.98), strip=0.004, uncertainty=0.4, noise=0.02,
+    CertifyConfig(), start_od=(0.01, 2.0), growth_shares=(0.04, 0.98), uncertainty=0.4, noise=0.02,
     error=0.2, error_od=0.006, error_share=0.06, error_gain=0.3,
 )  # fmt: skip
 
