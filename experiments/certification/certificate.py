@@ -13,13 +13,13 @@ from dqn.policy import RELATIVE, Policy, fingerprints
 from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig
+from experiments.certification.config import LIMITS, CertifyConfig
 from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Requirement, recheck, worst
 from experiments.certification.polygons import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 
-FORMAT = 3
+FORMAT = 4
 BETTER = "train with another seed or n_agents=8, or use policy=shipped"
 
 
@@ -90,6 +90,7 @@ def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, 
     asked = found.question
     return {
         "format": FORMAT,
+        "limits": asdict(asked.limits),
         "safe": found.safe,
         "passed": found.passed,
         "of": {**fingerprints(policy), **settings},
@@ -112,6 +113,8 @@ def load(path: Path) -> Stored:
         given = json.loads(path.read_text(encoding="utf-8"))
         if given["format"] != FORMAT:
             raise FormatError(f"has format {given['format']}, this version reads format {FORMAT}")
+        if given["limits"] != asdict(LIMITS):
+            raise FormatError("has other limits than this version")
         low, high = given["setpoints"]
         failed = tuple(_check(check) for check in given["checks"] if check["holds"] is not True)
         return Stored(
@@ -257,11 +260,9 @@ def _listed(checks: Sequence[Requirement]) -> str:
 
 
 def _short(failed: Sequence[Requirement], stored: Stored) -> list[str]:
-    """Return warnings: failed performance requirements, limits wider than the default, cases that are not proven."""
+    """Return warnings: failed performance requirements, cases that are not proven."""
     found = worst(check for check in failed if check.kind == PERFORMANCE)
     lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
-    if laxer := stored.config.laxer_limits(safety=False):
-        lines.append(f"its certificate uses wider performance limits: {'; '.join(laxer)}")
     if stored.bounds is None:  # docs/certificate.md has the growth shares that the pump holds for other policies
         lines += [f"not proven: {case}; use a faster pump or less volume" for case in stored.cannot_hold]
     return lines

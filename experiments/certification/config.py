@@ -1,6 +1,6 @@
 """Settings of a certificate: assumptions of the proof, and limits."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from conf.schema import check, part, require, setting
@@ -15,67 +15,41 @@ class Limits:
     """Limits of the requirements; docs/certificate.md has values of good and bad policies.
 
     Limits whose names begin with `safe_` are safety limits: a device refuses a policy that exceeds such a limit. The
-    others are performance limits: a device reports that a policy exceeds them, and runs it.
+    others are performance limits: a device reports that a policy exceeds them, and runs it. Limits of the half-width
+    are limits of the part beyond the one-line controller's.
 
-    Raises: ValueError with key, value and allowed range.
+    excess, excess_uncertain: half-width, OD: nominal model without noise; with noise and uncertainty.
+    excess_nominal, excess_share: half-width of a policy of (error, growth share), periods of full pump: exact
+    estimates; with errors.
+    entry: time to enter the allowed half-width, over that of a pump at full rate or off. late, late_slow: delay of the
+    entry after the one-line controller's, periods; with a lasting error of the gain.
+    low_dose: largest distance below the setpoint at which half of the largest dose is still given, periods of growth.
+    reached, reached_nominal: fraction of a band that trajectories must reach: with errors; with exact estimates.
+    safe_excess_median: median over the setpoints, OD; detects a policy for another pump.
+    watched_od, watched_share: largest errors of the estimates of OD and growth share at which the supervisor lets the
+    policy act.
     """
 
-    excess: float = setting(
-        0.012,
-        "half-width of the band beyond that of the one-line controller, without noise, nominal model",
-        "OD",
-        within=(0, 1),
-    )
-    excess_uncertain: float = setting(0.025, "`excess` with noise and uncertainty", "OD", within=(0, 1))
-    entry: float = setting(
-        1.15,
-        "time to enter the allowed half-width, over that of a pump at full rate or off",
-        within=(1, 100),
-    )
-    low_dose: float = setting(
-        1.0,
-        "largest distance below the setpoint at which half of the largest dose is still given",
-        "periods of growth",
-        within=(0, 100),
-    )
-    excess_nominal: float = setting(
-        0.005,
-        "policy of (error, growth share), exact estimates: half-width beyond the one-line controller's",
-        "periods of full pump",
-        within=(0, 10),
-    )
-    excess_share: float = setting(
-        1 / 64, "`excess_nominal` with errors, in every case", "periods of full pump", within=(0, 10)
-    )
-    late: float = setting(1, "delay of the entry after the one-line controller's", "periods", within=(0, 1000))
-    late_slow: float = setting(4, "`late` with a lasting error of the gain", "periods", within=(0, 1000))
-    reached: float = setting(0.95, "fraction of a band that trajectories must reach, with errors", within=(0, 1))
-    reached_nominal: float = setting(0.9, "`reached` with exact estimates", within=(0, 1))
-    safe_excess: float = setting(
-        0.05, "safety: half-width beyond the one-line controller's, without noise, nominal model", "OD", within=(0, 1)
-    )
-    safe_excess_median: float = setting(
-        0.01,
-        "safety: median of `safe_excess` over the setpoints; detects a policy for another pump",
-        "OD",
-        within=(0, 1),
-    )
-    safe_excess_uncertain: float = setting(0.2, "safety: `safe_excess` with noise and uncertainty", "OD", within=(0, 1))
-    safe_excess_share: float = setting(
-        0.025,
-        "safety, policy of (error, growth share), in every case: half-width beyond the one-line controller's",
-        "periods of full pump",
-        within=(0, 10),
-    )
-    safe_low_dose: float = setting(
-        2.0,
-        "safety: largest distance below the setpoint at which half of the largest dose is still given",
-        "periods of growth",
-        within=(0, 100),
-    )
+    excess: float = 0.012
+    excess_uncertain: float = 0.025
+    excess_nominal: float = 0.005
+    excess_share: float = 1 / 64
+    entry: float = 1.15
+    late: float = 1.0
+    late_slow: float = 4.0
+    low_dose: float = 1.0
+    reached: float = 0.95
+    reached_nominal: float = 0.9
+    safe_excess: float = 0.05
+    safe_excess_median: float = 0.01
+    safe_excess_uncertain: float = 0.2
+    safe_excess_share: float = 0.025
+    safe_low_dose: float = 2.0
+    watched_od: float = 0.04
+    watched_share: float = 0.5
 
-    def __post_init__(self) -> None:
-        check(self, "limits")
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True)
@@ -107,7 +81,6 @@ class CertifyConfig:
     setpoints: tuple[float, float] | None = setting(
         None, "range of setpoints; null: the range of the training", "OD", above=0.0, at_most=4.0, interval=True
     )
-    strip: float = setting(0.005, "width of the strips of setpoints, or growth shares", within=(1e-4, 0.1))
     growth_shares: tuple[float, float] = setting(
         (0.05, 0.97), "range of mu h / B, for a policy of (error, growth share)", within=(0, 1), interval=True
     )
@@ -123,35 +96,20 @@ class CertifyConfig:
         within=(1e-3, 2),
     )
     quick: bool = setting(False, "omit errors of the gain and full_pumps; a device refuses such a certificate")
-    watched_od: float = setting(
-        0.04, "largest error of the OD estimate at which the supervisor lets the policy act", "OD", within=(0, 0.2)
-    )
-    watched_share: float = setting(0.5, "like `watched_od`, for the growth share", within=(0, 0.5))
     trajectories: int = setting(
         20_000,
         "simulated worst-case trajectories per case, which try to leave the band",
         within=(0, 10_000_000),
     )
-    limits: Limits = part(Limits, "limits of the requirements")
 
     def laxer(self) -> list[str]:
         """List the values that make the proof of safety less strict than the defaults."""
         usual = CertifyConfig()
         named = [(n, own, by) for n in ASKED if (own := getattr(self, n)) < (by := getattr(usual, n))]
-        named += [("strip", self.strip, usual.strip)] if self.strip > usual.strip else []
         for name in ("start_od", "growth_shares"):
             own, by = getattr(self, name), getattr(usual, name)
             named += [(name, list(own), list(by))] if own[0] > by[0] or own[1] < by[1] else []
-        return [f"{name} = {own}, default {by}" for name, own, by in named] + self.laxer_limits(safety=True)
-
-    def laxer_limits(self, safety: bool) -> list[str]:
-        """List the limits of one kind that are less strict than the defaults; `reached*` are lower limits."""
-        found = []
-        for name in (f.name for f in fields(Limits) if f.name.startswith("safe_") is safety):
-            own, by = getattr(self.limits, name), getattr(Limits(), name)
-            if own < by if name.startswith("reached") else own > by:
-                found.append(f"limits.{name} = {own}, default {by}")
-        return found
+        return [f"{name} = {own}, default {by}" for name, own, by in named]
 
     def __post_init__(self) -> None:
         check(self)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dqn.policy import RELATIVE, Policy
-from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Mask, drops, points_in_strips
 from experiments.certification.loops import Loop
 from experiments.certification.polygons import Array, Network, Regions, contradictions, partition
@@ -132,7 +132,7 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
     proofs, doses = _proven(asked, wider, levels)
     checks = (
         Requirement("polygons that the bounds of boxes contradict", contradictions(network, exact, GRID), 0),
-        *_required(asked, proofs, doses[-1], config.limits),
+        *_required(asked, proofs, doses[-1]),
         *_attacks(policy, asked, proofs, config.trajectories),
     )
     return Certificate(asked, proofs, checks, levels, doses, drops(exact), exact, config.quick)
@@ -145,7 +145,7 @@ def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -
         lines = np.clip(np.asarray(setpoints, dtype=np.float64), *asked.setpoints)
         asked = replace(asked, loop=asked.loop.at(lines), median=None)
     proofs, doses = _proven(asked, partition(Network.of(policy), asked.box)[1], (_half(policy),))
-    return [check for check in _required(asked, proofs, doses[0], config.limits) if not check.holds]
+    return [check for check in _required(asked, proofs, doses[0]) if not check.holds]
 
 
 def _proven(asked: Question, wider: Regions, levels: Sequence[int]) -> tuple[tuple[Proof, ...], Array]:
@@ -185,7 +185,7 @@ def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajector
             yield Requirement(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}", PERFORMANCE)
 
 
-def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Requirement]:
+def _required(asked: Question, proofs: Sequence[Proof], dose: Array) -> Iterator[Requirement]:
     """Yield every requirement of the proofs with its worst strip.
 
     A strip that the pump cannot hold fails in the nominal case; other cases ignore such strips.
@@ -207,15 +207,15 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
         if name in asked.late:
             title, value, limit = "entry after the one-line controller's, periods", proof.later, asked.late[name]
         else:
-            title, value, limit = "entry time over the pump's own", proof.entry, limits.entry
+            title, value, limit = "entry time over the pump's own", proof.entry, asked.limits.entry
         yield _worst(f"{name}: {title}", asked, value, limit, held, PERFORMANCE)
         if name in asked.judged:
             title = f"{name}: half-width over that of the one-line controller"
             yield _worst(f"{title}, {asked.unit}", asked, proof.excess, asked.margins[name], held, PERFORMANCE)
             yield _worst(f"{title}, safety, {asked.unit}", asked, proof.excess, asked.judged[name], held)
     title = "half of the largest dose below the setpoint"
-    yield _worst(f"{title}, periods of growth", asked, dose, limits.low_dose, every, PERFORMANCE)
-    yield _worst(f"{title}, safety, periods of growth", asked, dose, limits.safe_low_dose, every)
+    yield _worst(f"{title}, periods of growth", asked, dose, asked.limits.low_dose, every, PERFORMANCE)
+    yield _worst(f"{title}, safety, periods of growth", asked, dose, asked.limits.safe_low_dose, every)
 
 
 def _count(name: str, asked: Question, wrong: Mask) -> Requirement:

@@ -10,10 +10,11 @@ from conf.schema import build
 from dqn.policy import ABSOLUTE, RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig
+from experiments.certification.config import LIMITS, CertifyConfig, Limits
 from experiments.certification.loops import OdCase, OdLoop, ShareCase, ShareLoop
 from experiments.certification.polygons import Array
 
+STRIP = 0.005  # largest width of the strips of setpoints, OD, or of growth shares
 BEYOND = 1e-6  # margin around the required range
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
 
@@ -34,7 +35,7 @@ class Question:
     of the policy. reached: fraction of the band that trajectories must reach, with exact estimates and with errors;
     None for a policy of the OD, whose band may contain gaps between several resting places.
     unit: unit of half-widths. what: second coordinate, of which strips are ranges. setpoints: lowest and highest, OD.
-    drawn: cases in the figure. bounds: on the errors of the estimator, None without an estimator.
+    drawn: cases in the figure. limits: of the requirements. bounds: on the errors of the estimator, None without one.
     median: safety limit of the median excess over the strips of the nominal case; None: no limit.
     """
 
@@ -49,6 +50,7 @@ class Question:
     what: str
     setpoints: tuple[float, float]
     drawn: tuple[str, ...]
+    limits: Limits
     bounds: EstimateBounds | None = None
     median: float | None = None
 
@@ -93,20 +95,20 @@ def full_pump(model: EnvConfig) -> float:
     return model.max_pump_rate * model.control_min / model.tau
 
 
-def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
-    edges = np.linspace(low, high, max(1, int(np.ceil((high - low) / width - 1e-9))) + 1)
+def _strips(low: float, high: float) -> tuple[Array, Array]:
+    edges = np.linspace(low, high, max(1, int(np.ceil((high - low) / STRIP - 1e-9))) + 1)
     return edges[:-1], edges[1:]
 
 
 def _of_od(policy: Policy, config: CertifyConfig) -> Question:
-    model, limits = model_of(policy, config), config.limits
+    model, limits = model_of(policy, config), LIMITS
     trained = policy.metadata.get("model", {}).get("setpoints", model.setpoints)
     low, high = config.setpoints or (min(trained), max(trained))
     if not low < high:
         raise CertificationError(f"setpoints {low:g} to {high:g}: allowed low < high; set setpoints=[LOW,HIGH]")
     if not (np.isneginf(policy.low) & np.isposinf(policy.high)).all():
         raise CertificationError("it clips OD or setpoint, which the proof does not cover; export it without limits")
-    strips = _strips(low, high, config.strip)
+    strips = _strips(low, high)
     loop = OdLoop(model.mu, model.tau, model.control_min, actions(policy), config.start_od, *strips)
     cases = (
         OdCase("nominal", 0.0, 0.0),
@@ -119,14 +121,14 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
     highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # highest start over a strip
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
     return Question(
-        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins),
+        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins), limits,
         median=limits.safe_excess_median,
     )  # fmt: skip
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
     """Build the question of a policy that sees (error, growth share)."""
-    model, limits, (low, high) = model_of(policy, config), config.limits, config.growth_shares
+    model, limits, (low, high) = model_of(policy, config), LIMITS, config.growth_shares
     clip = (np.asarray(policy.low, dtype=np.float64), np.asarray(policy.high, dtype=np.float64))
     if not clip[0][1] - BEYOND <= low < high <= clip[1][1] + BEYOND:
         raise CertificationError(
@@ -137,7 +139,7 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     middle = float(np.round((lowest + highest) / 2.0, 3))
     at_setpoints = sorted({lowest, middle, highest} if setpoints is None else set(setpoints))
     off = EstimateBounds(full, config.error, config.error_od, config.error_share, 0.0, (low, high), (lowest, highest))
-    watched = replace(off, od=config.watched_od, growth_share=config.watched_share)
+    watched = replace(off, od=limits.watched_od, growth_share=limits.watched_share)
     cases = [ShareCase("nominal", replace(off, error=0.0, od=0.0, growth_share=0.0)), ShareCase("errors", off)]
     for b in sorted({round(b, 9) for b in (full, *(() if config.quick else config.full_pumps))}):
         own = replace(off, full_pump=b)
@@ -154,13 +156,13 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     late = {case.name: limits.late_slow if case.slow else limits.late for case in cases}
     margins = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
     judged = dict.fromkeys(margins, limits.safe_excess_share)
-    loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
+    loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high), clip)
     seen = loop.seen(cases[-1])
     box = ((float(clip[0][0]), float(clip[1][0])), (float(seen[0].min()), float(seen[1].max())))
     reached = limits.reached_nominal, limits.reached
     what = "periods of full pump", "growth share"
     return Question(
-        loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched
+        loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), limits, watched
     )
 
 

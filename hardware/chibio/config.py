@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from conf.presets import groups
 from conf.schema import check, part, require, setting
-from hardware.chibio.dosing import DosingConfig, SupplyConfig
+from hardware.chibio.dosing import SupplyConfig
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS, Permitted
@@ -25,7 +25,6 @@ class ChiBioConfig:
     )
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
     stir: float = setting(0.5, "stirrer power", within=(0, 1))
-    dosing: DosingConfig = part(DosingConfig, "conversion of a pump rate into a dose")
     overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
     supply: SupplyConfig = part(SupplyConfig, "spare pumps for scenario.outputs and signals")
     fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "fluorescence measurement")
@@ -33,14 +32,6 @@ class ChiBioConfig:
     lost_s: float = setting(
         180.0, "age of the newest sample at which the experiment is restarted; above stale_s", "s", within=(100, 3600)
     )
-    poll_s: float = setting(2.0, "time between two requests for an expected sample", "s", within=(0.2, 10))
-    window_s: float = setting(
-        38.0,
-        "latest end of a dose after its sample; the next measurement begins after 47 s",
-        "s",
-        within=(10, 42),
-    )
-    retry_s: float = setting(5.0, "time before a failed request is repeated", "s", within=(0.5, 60))
     stop_s: float = setting(
         60.0, "time in which a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
     )

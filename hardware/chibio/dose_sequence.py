@@ -24,6 +24,8 @@ from hardware.storage.doses import Given
 DOSE_OFF_S = 2.0  # from the planned end of a dose to the off command, for delays of link and bus
 WASTE_FIRST_S = 1.0  # from waste pump on to feed pump on: a motor starts 0.2 to 0.7 s after the answer
 LATE_S = 3600.0  # a tunnel may deliver a command up to this long after the client gave up on it
+OFF_AGAIN_S = 2.0  # before an off command is repeated
+WINDOW_S = 38.0  # latest end of a dose after its sample; the next measurement begins after 47 s
 REFUSALS = 4  # failed attempts in a row to switch the pumps off, until the experiment is ended
 SLOW_S = 1.0  # a slower answer to a pump command is reported
 
@@ -117,11 +119,11 @@ class DoseSequence:
     def _plan(self, rate: float, pump: str) -> DosePlan:
         """Plan the dose of a pump; a spare pump uses its configured flow and carries nothing over."""
         if pump == FEED:
-            return plan_dose(rate, self.carry_ml, self._past().doses, self._calibration, self._config.dosing)
+            return plan_dose(rate, self.carry_ml, self._past().doses, self._calibration)
         if pump not in self._config.supply.pumps:
             return DosePlan(pump=pump)
         own = replace(self._calibration, feed=self._calibrated(pump))
-        return replace(plan_dose(rate, 0.0, self._past().doses, own, self._config.dosing), pump=pump)
+        return replace(plan_dose(rate, 0.0, self._past().doses, own), pump=pump)
 
     def _calibrated(self, pump: str) -> PumpCalibration:
         return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
@@ -135,9 +137,9 @@ class DoseSequence:
         past_s = self._clock.now() - appeared_s
         if math.isinf(past_s):
             return messages.UnknownAge()
-        if past_s + waste_s > self._config.window_s:
+        if past_s + waste_s > WINDOW_S:
             return messages.SampleTooOld(past_s=past_s)
-        if past_s + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # time for `_set_targets`
+        if past_s + 2.0 * self._connection.took_s + waste_s > WINDOW_S:  # time for `_set_targets`
             return messages.TooSlow(past_s=past_s)
         return None
 
@@ -189,7 +191,7 @@ class DoseSequence:
         if not as_set or on or not state.running or state.regulating:
             raise messages.NotAsSet(targets=tuple(targets), pumps=on or "none")
         past_s = self._clock.now() - appeared_s
-        if past_s + plan.waste_s > self._config.window_s:
+        if past_s + plan.waste_s > WINDOW_S:
             raise messages.TooSlow(past_s=past_s)
 
     def _feed_off(self, pump: str) -> Task:
@@ -208,7 +210,7 @@ class DoseSequence:
 
     def _pause_s(self) -> float:
         """Return the pause until the next attempt, s; it is longer while the reactor is absent or exchanged."""
-        return min(self._config.retry_s, 2.0) if self._connection.state is not None else 30.0
+        return OFF_AGAIN_S if self._connection.state is not None else 30.0
 
     def _finish(self) -> Task:
         """Task: try until all pumps are verified off, then record the end of the dose."""

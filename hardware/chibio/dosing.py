@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`protocol.check_command`) refuses more
 DOSE_ML = 0.5  # smallest dose of a spare pump, envs/scenario.py
+WASTE_FACTOR, WASTE_EXTRA_S = 4.0, 4.4  # the device's own; longer does no harm, as the waste tube sets the level
+CLEAR_EVERY, CLEAR_DUTY = 5, 0.25  # every so many doses the waste pump clears its tube, fraction of 63 s
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 
@@ -72,23 +74,6 @@ class ReactorCalibration:
 
 
 @dataclass(frozen=True)
-class DosingConfig:
-    """Conversion of a feed rate into a dose of feed and a dose of waste.
-
-    The waste pump runs for at least waste_factor * feed time + waste_extra_s; the device itself uses 4 and 4.4 s. A
-    longer time does no harm, because the height of the waste tube sets the level.
-    """
-
-    waste_factor: float = setting(4.0, "waste time over feed time", at_least=4.0, note="less risks an overflow")
-    waste_extra_s: float = setting(4.4, "additional waste time", "s", at_least=4.0, note="less risks an overflow")
-    clear_every: int = setting(5, "doses between two clearings of the waste tube", at_least=1)
-    clear_duty: float = setting(0.25, "fraction of 63 s for which it is cleared", above=0.0, at_most=MAX_WASTE_DUTY)
-
-    def __post_init__(self) -> None:
-        check(self, "dosing")
-
-
-@dataclass(frozen=True)
 class SupplyConfig:
     """Spare pumps for a second medium, an inducer or a stressor; a standard reactor has no tubes on them."""
 
@@ -141,15 +126,13 @@ class DosePlan(Plan):
         return PERIOD_S * self.waste_duty
 
 
-def plan_dose(
-    rate: float, carry_ml: float, doses: int, calibration: ReactorCalibration, config: DosingConfig
-) -> DosePlan:
+def plan_dose(rate: float, carry_ml: float, doses: int, calibration: ReactorCalibration) -> DosePlan:
     """Plan the dose that gives `rate` over one control period plus the volume carried over from earlier periods.
 
     feed duty = (v / q - bias) / 63 with v = rate * period + carry. While v is below the smallest dose, nothing is dosed
     and v becomes the new carry, so the mean flow is right even if single doses are too small for the pump.
     Args: rate: mean feed rate, mL/s. carry_ml: carry of the previous plan, mL. doses: number of doses given so far;
-      every `clear_every`-th dose clears the waste tube.
+      every `CLEAR_EVERY`-th dose clears the waste tube.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):
@@ -164,9 +147,9 @@ def plan_dose(
     feed_s = PERIOD_S * feed_duty
     feed_ml = feed.volume(feed_s)
     # factor * feed time + extra, and at least 1.5 times the fed volume if the waste pump is weaker
-    waste_s = max(config.waste_factor * feed_s + config.waste_extra_s, waste.on_time(1.5 * feed_ml))
-    if (doses + 1) % config.clear_every == 0:
-        waste_s = max(waste_s, PERIOD_S * config.clear_duty)
+    waste_s = max(WASTE_FACTOR * feed_s + WASTE_EXTRA_S, waste.on_time(1.5 * feed_ml))
+    if (doses + 1) % CLEAR_EVERY == 0:
+        waste_s = max(waste_s, PERIOD_S * CLEAR_DUTY)
     waste_duty = min(math.ceil(waste_s / PERIOD_S * 1e6) / 1e6, MAX_WASTE_DUTY)
     left = max(volume - feed_ml, 0.0)
     return DosePlan(

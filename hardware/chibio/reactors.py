@@ -17,7 +17,7 @@ from hardware.chibio import messages
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.dose_sequence import REFUSALS
+from hardware.chibio.dose_sequence import OFF_AGAIN_S, REFUSALS
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.resume import ReactorHistory, replay
@@ -148,7 +148,7 @@ class ChiBioReactors(Stations[ChibioStation, ReactorHistory]):
             if (tries := tries + 1) == REFUSALS:  # a reactor that answers and does not obey
                 for station in (one for one, error in pending.items() if isinstance(error, DeviceStateError)):
                     station.connection.escalate()
-            self._clock.sleep(min(self.config.retry_s, 2.0))
+            self._clock.sleep(OFF_AGAIN_S)
             pending = failed(list(pending))
         self._agenda.clear()
         for station in pending:

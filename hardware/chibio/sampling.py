@@ -11,6 +11,7 @@ from hardware.clock import Clock
 from hardware.stations import Newest
 
 CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
+POLL_S = 2.0  # between two requests for an expected sample
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 
 
@@ -26,7 +27,7 @@ class Sampling(Newest):
 
     def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
         super().__init__(clock.now())
-        self._config, self._clock, self.next_look, self.blank = config, clock, clock.now(), math.nan
+        self._clock, self.next_look, self.blank = clock, clock.now(), math.nan
         self.fluorescence = math.nan if config.fluorescence.measure else None
         self.key: tuple[float, int] | None = None
         self.late_s = 0.0
@@ -53,7 +54,7 @@ class Sampling(Newest):
 
         `cycles` counts cycles begun, so a sample that is seen late may already carry the next cycle's number.
         """
-        self.next_look = now + self._config.poll_s
+        self.next_look = now + POLL_S
         return math.isfinite(state.sample_s) and (
             self.key is None or (state.sample_s != self.key[0] and state.cycles >= self.key[1])
         )

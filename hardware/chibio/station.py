@@ -27,6 +27,7 @@ from hardware.stations import Station
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 MEASURING_S = 20.0  # settling, four readings, three temperatures and three fluorescence slots take less
 HELD_S = 30.0  # longest time that a new sample waits for the volume of the last dose
+RETRY_S = 5.0  # before a failed request is repeated
 STARTS = 3  # attempts to start an experiment before it counts as failed
 AGAIN_S = 60.0  # pause after a restart that failed
 
@@ -166,7 +167,7 @@ class ChibioStation(Station):
                 self.connection.post(f"/Experiment/1/{self.name}")
                 self.overflow_pump.was_on = False  # a start switches every pump off
             except LinkError:
-                yield self._config.retry_s
+                yield RETRY_S
         if not self.connection.read().running:
             raise messages.DoesNotStart(reactor=self.name)
 
@@ -195,7 +196,7 @@ class ChibioStation(Station):
 
     def poll(self) -> bool:
         """Read the reactor; return whether it has a new sample. An error becomes the logbook's fault."""
-        self.sampling.next_look = self._clock.now() + self._config.retry_s
+        self.sampling.next_look = self._clock.now() + RETRY_S
         try:
             if not self.restored:
                 if not self.busy:

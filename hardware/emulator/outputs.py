@@ -173,7 +173,7 @@ class Outputs:
         pump, computer = self._position.data[item], self._position.computer
         mine = self._pump_threads[item] = (self._pump_threads[item] + 1) % 100
         config = self._position.vial.config if self._position.vial is not None else VialConfig()
-        delay = computer.rng.uniform(config.pump_start_low_s, config.pump_start_high_s)
+        delay = computer.rng.uniform(*config.pump_start_s)
         yield OFF_SHARE * delay
         if abs(pump["target"] * pump["ON"]) != 1 and mine == self._pump_threads[item]:
             self._position.hardware().drive(item, 0, computer.now())
@@ -189,7 +189,7 @@ class Outputs:
         vial = self._position.hardware()
         if mine == self._pump_threads[item] and pump["target"] != 0:
             vial.drive(item, 1 if pump["target"] > 0 else -1, computer.now())
-        yield on_s + computer.rng.uniform(vial.config.on_time_bias_low_s, vial.config.on_time_bias_high_s)
+        yield on_s + computer.rng.uniform(*vial.config.on_time_bias_s)
         if abs(pump["target"]) != 1 and mine == self._pump_threads[item]:
             self._position.hardware().drive(item, 0, computer.now())
         pause = period - round(computer.wall() - began, 2)

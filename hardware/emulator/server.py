@@ -208,7 +208,7 @@ def parser() -> argparse.ArgumentParser:
     program = "python -m hardware.emulator"
     usage = f"{program} [--reactors M0,M1] [--speed 60] ...; {program} --help says all"
     p = argparse.ArgumentParser(prog=program, usage=usage, description="Emulated Chi.Bio behind HTTP.")
-    add, start = p.add_argument, VialConfig()
+    add = p.add_argument
     add("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     add("--port", type=int, default=5000, help="port of the device; 0: any free port (default %(default)s)")
     add("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
@@ -232,7 +232,7 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        default=(start.pump_start_low_s, start.pump_start_high_s),
+        default=VialConfig().pump_start_s,
         help="time from the answer to a pump command until its motor turns, s (default %(default)s)",
     )
     add("--unit", type=int, default=os.getpid(), help="number of the device, sets its identities (default: unique)")
@@ -251,9 +251,8 @@ def _numbers(what: str, given: str) -> float | list[float]:
 def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDevice:
     """Build the device of the arguments, on `clock` or else in scaled real time. Raises: ValueError."""
     ods, volumes_ml = _numbers("od", arguments.od), _numbers("volume", arguments.volume)
-    low, high = arguments.pump_start
     vial = VialConfig(
-        overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
+        overflow_pump=arguments.overflow_pump, pump_start_s=tuple(arguments.pump_start),
         pump3_ml_s=arguments.pump3_flow, pump4_ml_s=arguments.pump4_flow,
     )  # fmt: skip
     plant = with_options(plant_preset(arguments.plant), vars(arguments))

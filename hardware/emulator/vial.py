@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from conf.schema import check, require, setting
+from conf.schema import check, setting
 from envs.plant.plant import Plant
 from envs.plant.sensor import density
 from hardware.emulator.faults import Switches
@@ -23,6 +23,7 @@ AIR_C = 24.0  # outside the reactor
 DARK_COUNTS = 3.0  # of the spectrometer without light
 LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
+STIR_FACTOR = 0.4  # raw counts while stirring, relative to still medium
 STIR_SETTLE_S = 2.0  # readings less than this after a stop of the stirrer are disturbed
 STIR_STOPPED_S = 90.0  # cells settle if the stirrer is off for longer
 DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
@@ -57,35 +58,27 @@ class VialConfig:
     0.2 to 0.7 s in runs of the device's software with simulated electronics and bus times.
     """
 
-    blank_low: float = setting(11600.0, "lowest counts of clear medium", within=(3000, 60000))
-    blank_high: float = setting(15800.0, "highest counts of clear medium", at_most=60000.0)
+    blank: tuple[float, float] = setting(
+        (11600.0, 15800.0), "range of the counts of clear medium", within=(3000, 60000), interval=True
+    )
     noise_fraction: float = setting(0.003, "sd of one reading relative to the raw counts", within=(0, 0.2))
     common_fraction: float = setting(
         0.004, "sd common to all readings of one measurement, relative to the raw counts", within=(0, 0.2)
     )
     outlier_rate: float = setting(0.006, "probability of an isolated jump of more than 0.04 OD", within=(0, 1))
-    stir_factor: float = setting(0.4, "raw counts while stirring, relative to still medium", within=(0.05, 1))
-    stir_noise: float = setting(0.05, "relative spread of that factor", within=(0, 0.5))
-    on_time_bias_low_s: float = setting(
-        0.02, "shortest extra on-time of a pump (docs/device.md, Pumps)", "s", within=(0, 1)
+    stir_noise: float = setting(0.05, "relative spread of the raw counts while stirring", within=(0, 0.5))
+    on_time_bias_s: tuple[float, float] = setting(
+        (0.02, 0.2), "range of a pump's extra on-time (docs/device.md, Pumps)", "s", within=(0, 1), interval=True
     )
-    on_time_bias_high_s: float = setting(0.2, "longest extra on-time of a pump", "s", at_most=1.0)
-    pump_start_low_s: float = setting(
-        0.2, "shortest time from the reply to a pump command until the motor turns", "s", within=(0, 5)
+    pump_start_s: tuple[float, float] = setting(
+        (0.2, 0.7), "time from the reply to a pump command until the motor turns", "s", within=(0, 5), interval=True
     )
-    pump_start_high_s: float = setting(0.7, "longest time until the motor turns", "s", at_most=5.0)
     pump3_ml_s: float = setting(0.0, "flow of Pump3 if it supplies a second fluid", "mL/s", within=(0, 5))
     pump4_ml_s: float = setting(0.0, "flow of Pump4 if it supplies a second fluid", "mL/s", within=(0, 5))
     overflow_pump: str = setting("", "pump whose tube ends slightly above the waste tube", choices=(*SPARE, ""))
 
     def __post_init__(self) -> None:
         check(self, "vial")
-        for key, low, high in (
-            ("blank_high", self.blank_low, 60000.0),
-            ("on_time_bias_high_s", self.on_time_bias_low_s, 1.0),
-            ("pump_start_high_s", self.pump_start_low_s, 5.0),
-        ):
-            require(low <= getattr(self, key), f"vial.{key}", getattr(self, key), f"{low:g} to {high:g}")
 
 
 class Spectrometer:
@@ -93,7 +86,7 @@ class Spectrometer:
 
     def __init__(self, config: VialConfig, faults: Switches, rng: np.random.Generator) -> None:
         self._config, self._faults, self._rng = config, faults, rng
-        self.blank = float(rng.uniform(config.blank_low, config.blank_high))
+        self.blank = float(rng.uniform(*config.blank))
         self._lit, self._lit_before, self._laser_since = 0.0, 0.0, np.nan
         self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
 
@@ -130,7 +123,7 @@ class Spectrometer:
             return self._last_raw
         light = self.blank * 10.0 ** -float(density(od + f.od_offset + self._jump))
         if moving:
-            light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
+            light *= max(STIR_FACTOR * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
         light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
         lit = min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)
         self._last_raw = int(np.clip(round(DARK_COUNTS + light * lit), 0, FULL_SCALE))

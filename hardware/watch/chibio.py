@@ -12,6 +12,7 @@ import numpy as np
 
 from hardware.chibio.messages import WrongStatus
 from hardware.chibio.protocol import FEED, DeviceState, parse_state
+from hardware.chibio.sampling import POLL_S
 from hardware.clock import Clock
 from hardware.errors import ReactorError
 from hardware.link.transport import Reply
@@ -25,11 +26,11 @@ CYCLE_S = 56.0  # shortest time between two samples
 
 
 class WatchedChiBio(Watched):
-    """One reactor that something else regulates, read by `get` every poll_s. Args: flow_ml_s: flow of the feed pump."""
+    """One reactor that something else regulates, read by `get` every POLL_S. Args: flow_ml_s: flow of the feed pump."""
 
-    def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float, poll_s: float) -> None:
+    def __init__(self, get: Callable[[str], Reply], clock: Clock, name: str, flow_ml_s: float) -> None:
         super().__init__((name,))
-        self._get, self._clock, self._flow_ml_s, self._poll_s = get, clock, flow_ml_s, poll_s
+        self._get, self._clock, self._flow_ml_s = get, clock, flow_ml_s
         self._began_s = self._arrived_s = clock.now()
         self._sample_s, self._device_id = math.nan, ""
         self._newest = np.full(5, math.nan)  # at, OD, temperature, raw, blank
@@ -41,7 +42,7 @@ class WatchedChiBio(Watched):
         self._clock.sleep(max(self._arrived_s + CYCLE_S - self._clock.now(), 0.0))
         until_s, fault, fresh = self._clock.now() + AGAIN_S, None, False
         while not fresh and self._clock.now() < until_s:
-            self._clock.sleep(self._poll_s)
+            self._clock.sleep(POLL_S)
             try:
                 fresh, fault = self._look()
             except ReactorError as error:

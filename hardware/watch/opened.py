@@ -53,7 +53,7 @@ class WatchedFamily(Family):
         (calibration,) = load_calibrations(Path(backend.calibration), backend.reactors)
         with closing(HttpTransport(backend.url, backend.speed, backend.transport)) as link:
             clock, (name,) = DeviceClock(backend.speed), backend.reactors
-            yield WatchedChiBio(link.get, clock, name, calibration.feed.flow_ml_s, backend.poll_s)
+            yield WatchedChiBio(link.get, clock, name, calibration.feed.flow_ml_s)
 
     def fits(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario], ends: Sequence[str]) -> None:
         said = "watch=true: "

@@ -80,8 +80,8 @@ class ScriptedClock(VirtualClock):
 def _plumbed(options: DeviceOptions, overflow: OverflowPumpConfig, supply: SupplyConfig) -> DeviceOptions:
     """The same device with a second waste tube on the overflow pump, and the bottles of supply pumps."""
     pump = replace(options.plant.pump, overflow_ml_s=overflow.flow_ml_s)
-    flows = {"pump3_ml_s": supply.pump3_ml_s, "pump4_ml_s": supply.pump4_ml_s}
-    vial = replace(options.vial, overflow_pump=overflow.pump, **flows)
+    flows = supply.pump3_ml_s, supply.pump4_ml_s
+    vial = replace(options.vial, overflow_pump=overflow.pump, pump3_ml_s=flows[0], pump4_ml_s=flows[1])
     return replace(options, vial=vial, plant=replace(options.plant, pump=pump))
 
 

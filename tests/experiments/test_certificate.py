@@ -3,7 +3,7 @@
 import json
 import re
 import shutil
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ from experiments import certify as command
 from experiments import deploy
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.config import LIMITS, CertifyConfig
 from experiments.certification.figure import figure
 from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate, Requirement, certify, recheck, worst
 from experiments.certification.question import CertificationError, question
@@ -447,8 +447,12 @@ def test_a_policy_that_is_not_safe_ends_the_command_with_one_line_and_its_certif
     assert (stored.safe, stored.passed) == (False, False)
 
 
-def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_says_what(undrawn, tmp_path, caplog):
-    certified(laws.law(), tmp_path, "limits.entry=1", "limits.excess=0.0001")
+def test_a_policy_that_only_lacks_performance_is_certified_with_a_warning_that_says_what(
+    undrawn, tmp_path, caplog, monkeypatch
+):
+    for module in ("certificate", "question"):
+        monkeypatch.setattr(f"experiments.certification.{module}.LIMITS", replace(LIMITS, entry=1.0, excess=1e-4))
+    certified(laws.law(), tmp_path)
     stored = certificate.load(tmp_path / "certificate.json")
     assert (stored.safe, stored.passed) == (True, False)
     (warned,) = warnings(caplog)
@@ -570,46 +574,32 @@ def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
 
 ATTACKED_BY_LESS = {
     "start_od": [(0.1, 1.5), (0.05, 1.2)], "growth_shares": [(0.3, 0.98), (0.04, 0.5)],
-    "strip": [0.006], "uncertainty": [0.2], "noise": [0.01], "error": [0.0], "error_od": [0.004],
+    "uncertainty": [0.2], "noise": [0.01], "error": [0.0], "error_od": [0.004],
     "error_share": [0.04], "error_gain": [0.1],
 }  # fmt: skip
-"""Settings by which less is asked of safety, beside the limits."""
+"""Settings by which less is asked of safety."""
 MORE = replace(
-    CertifyConfig(), start_od=(0.01, 2.0), growth_shares=(0.04, 0.98), strip=0.004, uncertainty=0.4, noise=0.02,
+    CertifyConfig(), start_od=(0.01, 2.0), growth_shares=(0.04, 0.98), uncertainty=0.4, noise=0.02,
     error=0.2, error_od=0.006, error_share=0.06, error_gain=0.3,
-    limits=Limits(**{f.name: getattr(Limits(), f.name) * (1.01 if f.name.startswith("reached") else 0.99)
-                     if f.name != "entry" else 1.1 for f in fields(Limits)}),
 )  # fmt: skip
 
 
 def test_whatever_is_asked_less_of_is_named_alone_and_what_is_asked_more_of_is_not() -> None:
-    """A limit of safety is a reason to refuse, one of performance is told; the attack's share is a least one."""
-    assert CertifyConfig().laxer() == CertifyConfig().laxer_limits(safety=False) == []
-    assert MORE.laxer() == MORE.laxer_limits(safety=False) == []
+    assert CertifyConfig().laxer() == MORE.laxer() == []
     for name, values in ATTACKED_BY_LESS.items():
         for value in values:
             (named,) = replace(MORE, **{name: value}).laxer()
             shown = list(value) if isinstance(value, tuple) else value
             assert named.startswith(f"{name} = {shown}, ")
-            assert replace(MORE, **{name: value}).laxer_limits(safety=False) == []
-    for f in fields(Limits):
-        own = getattr(Limits(), f.name) * (0.9 if f.name.startswith("reached") else 1.1)
-        config = replace(MORE, limits=replace(MORE.limits, **{f.name: own}))
-        named, other = config.laxer(), config.laxer_limits(safety=False)
-        named, other = (named, other) if f.name.startswith("safe_") else (other, named)
-        assert (len(named), other) == (1, [])
-        assert named[0].startswith(f"limits.{f.name} = {own}, ")
 
 
-def test_a_certificate_that_asks_for_less_is_refused_if_less_of_safety_and_told_if_less_of_performance(tmp_path):
-    limits = replace(Limits(), safe_excess=1.0, entry=2.0)
-    for k, (config, less) in enumerate(((replace(ASKED, noise=0.0, limits=limits), True),
-                                        (replace(ASKED, limits=Limits(entry=2.0)), False))):  # fmt: skip
-        source = written(tmp_path / f"{k}.npz", laws.law(), config=config)
-        found = concluded(laws.law(), source)
-        assert bool(found.refused) is less
-        assert not less or all(part in found.refused[0] for part in ("noise = 0.0, ", "limits.safe_excess = 1.0, "))
-        assert "limits.entry = 2.0, " in "".join(found.short)
+def test_a_certificate_that_asks_for_less_or_has_other_limits_is_refused(tmp_path: Path) -> None:
+    less = written(tmp_path / "less.npz", laws.law(), config=replace(ASKED, noise=0.0))
+    assert "noise = 0.0, " in concluded(laws.law(), less).refused[0]
+    for key, limit in asdict(LIMITS).items():
+        other = written(tmp_path / "other.npz", laws.law(), limits=asdict(LIMITS) | {key: 1.01 * limit})
+        assert "other limits" in concluded(laws.law(), other).refused[0]
+        assert certificate.bounds(laws.law(), settings(laws.law()), other, EnvConfig()) is None
 
 
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])

@@ -429,7 +429,7 @@ def test_every_setpoint_of_a_range_fails_where_nothing_is_entered() -> None:
         proof, band=replace(proof.band, high=proof.band.high - 0.01, path=np.full_like(proof.band.path, 9.0))
     )
     asked, dose = proven(laws.law()).question, np.zeros(80)
-    counted = {c.title: c.value for c in _required(asked, [never], dose, FAST.limits)}
+    counted = {c.title: c.value for c in _required(asked, [never], dose)}
     assert counted["strips whose band is not entered"] == 80.0
     assert counted["strips without a band"] == 0.0
 

@@ -14,7 +14,7 @@ from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification import judge
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig
+from experiments.certification.config import LIMITS, CertifyConfig
 from experiments.certification.intervals import Band, Pieces, images
 from experiments.certification.judge import certify, recheck
 from experiments.certification.loops import ShareCase, ShareLoop
@@ -302,16 +302,16 @@ def test_full_pump_is_that_of_the_bench_in_all_its_parts_unless_a_model_is_given
 def test_what_the_supervisor_is_to_watch_is_the_largest_error_that_is_proven() -> None:
     """Its own bounds of OD and growth share, and a gain that is exact; the others are those that are asked for."""
     changes: dict[str, Any] = {"error": 0.2, "error_od": 0.006, "error_share": 0.04, "error_gain": 0.1}
-    config = replace(FAST, watched_od=0.03, watched_share=0.4, growth_shares=(0.1, 0.9), strip=0.1, **changes)
+    config = replace(FAST, growth_shares=(0.1, 0.9), **changes)
     asked = question(laws.share_law(), config)
     assert asked.bounds == asked.cases[-1].bounds
-    watched = EstimateBounds(B, 0.2, 0.03, 0.4, 0.0, (0.1, 0.9), (0.2, 1.0))
+    watched = EstimateBounds(B, 0.2, 0.04, 0.5, 0.0, (0.1, 0.9), (0.2, 1.0))
     assert replace(asked.bounds, full_pump=B) == watched
     exact, errors = (case.bounds for case in asked.cases[:2])
     assert (exact.error, exact.od, exact.growth_share) == (0.0, 0.0, 0.0)
     assert (errors.error, errors.od, errors.growth_share, errors.gain) == (0.2, 0.006, 0.04, 0.0)
     assert {case.bounds.gain for case in asked.cases[2:-1]} == {0.0, 0.1}
-    assert (asked.loop.low[0], asked.loop.high[-1], asked.loop.low.size) == (0.1, 0.9, 8)
+    assert (asked.loop.low[0], asked.loop.high[-1], asked.loop.low.size) == (0.1, 0.9, 160)
 
 
 def test_the_setpoints_that_are_named_are_those_that_are_asked_about() -> None:
@@ -499,13 +499,14 @@ def test_what_the_pump_cannot_hold_with_weaker_doses_is_said() -> None:
     assert all(proof.holdable.all() for proof in found.proofs if not proof.case.name.startswith("spread"))
 
 
-def test_a_device_asks_the_same_as_the_command() -> None:
+def test_a_device_asks_the_same_as_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     """With limits that nothing meets, every case of one B at the three setpoints has the same worst value in both.
 
     The device asks at the setpoints of its run, whatever those of the certificate are.
     """
-    strict = replace(FAST.limits, excess_share=1e-9, excess_nominal=1e-9, late=0, late_slow=0)
-    config = replace(FAST, full_pumps=(), limits=strict)
+    strict = replace(LIMITS, excess_share=1e-9, excess_nominal=1e-9, late=0.0, late_slow=0.0)
+    monkeypatch.setattr("experiments.certification.question.LIMITS", strict)
+    config = replace(FAST, full_pumps=())
     policy = laws.share_law(offset=0.03)
     proven = certify(policy, replace(config, setpoints=(0.3, 0.7)))
     wanted = {c.name: c.value for c in proven.checks if "half-width" in c.name and not c.holds}
@@ -515,8 +516,9 @@ def test_a_device_asks_the_same_as_the_command() -> None:
     assert {name: found[name] for name in wanted} == pytest.approx(wanted, abs=1e-9)
 
 
-def test_strips_cover_the_range_where_their_width_does_not_divide_it() -> None:
-    asked = question(laws.share_law(), replace(FAST, strip=0.03)).loop
+def test_strips_cover_the_range_where_their_width_does_not_divide_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("experiments.certification.question.STRIP", 0.03)
+    asked = question(laws.share_law(), FAST).loop
     assert (asked.low[0], asked.high[-1]) == (0.05, 0.97)
     np.testing.assert_array_equal(asked.low[1:], asked.high[:-1])
     assert (asked.high - asked.low).max() <= 0.03 + 1e-12

@@ -18,14 +18,12 @@ START_S = 0.45  # from the answer to a pump command until the motor turns
 STOP_S = 0.09  # and until one that runs stands still
 
 
-def quiet(mu: float = 0.0, **vial: float) -> DeviceOptions:
+def quiet(mu: float = 0.0, **vial: Any) -> DeviceOptions:
     """No noise, known blank, constant pump bias and delay, a culture that grows with mu (1/min)."""
-    fixed = dict.fromkeys(("noise_fraction", "common_fraction", "outlier_rate", "stir_noise"), 0.0)
-    for key, value in (("blank_{}", BLANK), ("on_time_bias_{}_s", BIAS_S), ("pump_start_{}_s", START_S)):
-        fixed |= {key.format("low"): value, key.format("high"): value}
-    fixed |= vial
+    fixed: dict[str, Any] = dict.fromkeys(("noise_fraction", "common_fraction", "outlier_rate", "stir_noise"), 0.0)
+    fixed |= {"blank": (BLANK, BLANK), "on_time_bias_s": (BIAS_S, BIAS_S), "pump_start_s": (START_S, START_S)}
     plant = PlantConfig(growth=GrowthConfig(mu=mu), pump=PumpConfig(dosing="pulse"))
-    return DeviceOptions(vial=VialConfig(**fixed), plant=plant)
+    return DeviceOptions(vial=VialConfig(**fixed | vial), plant=plant)
 
 
 class Lab:

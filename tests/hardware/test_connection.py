@@ -274,14 +274,6 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
     assert late == [0.0, 4.0, math.inf, 0.0, 9.0, math.inf, 0.0, 5.0, math.inf, 0.0, 2.0]
 
 
-def test_looks_are_as_far_apart_as_is_set() -> None:
-    clock = VirtualClock(500.0)
-    sampling = Sampling(replace(CONFIG, poll_s=7.0), clock)
-    assert sampling.next_look == sampling.arrived_s == 500.0
-    sampling.look(sample(math.nan, 0), 500.0)
-    assert sampling.next_look == 507.0
-
-
 def test_a_sample_is_made_of_its_own_numbers() -> None:
     clock = VirtualClock(70.0)
     sampling = Sampling(CONFIG, clock)

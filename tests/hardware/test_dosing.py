@@ -13,18 +13,17 @@ from hypothesis import strategies as st
 
 from hardware.chibio.calibrations import load_calibrations, save_calibration
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import DosingConfig, PumpCalibration, ReactorCalibration, SupplyConfig, fit_pump, plan_dose
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration, SupplyConfig, fit_pump, plan_dose
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.errors import UnfitError
 
-CONFIG = DosingConfig()
 FOURTH = SupplyConfig(pump4_ml_s=0.5)
 
 
 def test_small_doses_are_saved_up_and_the_mean_rate_is_right() -> None:
     rate, carry, given_ml, doses = 0.00125, 0.0, 0.0, 0
     for _ in range(1000):
-        plan = plan_dose(rate, carry, doses, ReactorCalibration(), CONFIG)
+        plan = plan_dose(rate, carry, doses, ReactorCalibration())
         carry = plan.carry_ml
         given_ml += plan.feed_ml
         doses += plan.feed_duty > 0.0
@@ -36,7 +35,7 @@ def test_small_doses_are_saved_up_and_the_mean_rate_is_right() -> None:
 @pytest.mark.parametrize("rate", [-0.001, np.nan, np.inf])
 def test_a_rate_that_is_none_is_an_error(rate: float) -> None:
     with pytest.raises(ValueError, match="pump rate"):
-        plan_dose(rate, 0.0, 0, ReactorCalibration(), CONFIG)
+        plan_dose(rate, 0.0, 0, ReactorCalibration())
 
 
 NOMINAL = PumpCalibration()
@@ -67,7 +66,7 @@ def test_doses_worked_out_by_hand(
     rate: float, carry: float, doses: int, feed: PumpCalibration, waste: PumpCalibration, feed_s: float,
     waste_s: float, left: tuple[float, float],
 ) -> None:  # fmt: skip
-    plan = plan_dose(rate, carry, doses, ReactorCalibration(feed, waste), CONFIG)
+    plan = plan_dose(rate, carry, doses, ReactorCalibration(feed, waste))
     assert (plan.feed_s, plan.waste_s) == pytest.approx((feed_s, waste_s), abs=1e-3)
     assert (plan.carry_ml, plan.shortfall_ml) == pytest.approx(left, abs=1e-9)
     assert plan.feed_s <= feed_s + 1e-9  # the duty is cut to six places
@@ -105,7 +104,7 @@ def test_a_pump_nobody_weighed() -> None:
 @given(st.floats(0.0, 0.05), st.floats(0.0, 0.5), st.integers(0, 100), *2 * [st.floats(0.1, 3.0)], st.floats(-0.2, 0.3))
 def test_no_plan_breaks_a_limit(rate: float, carry: float, doses: int, q1: float, q2: float, bias: float) -> None:
     rig = ReactorCalibration(PumpCalibration(q1, bias), PumpCalibration(q2, bias))
-    plan = plan_dose(rate, carry, doses, rig, CONFIG)
+    plan = plan_dose(rate, carry, doses, rig)
     assert 0.0 <= plan.feed_duty <= 0.05
     assert 0.0 <= plan.waste_duty <= 0.5
     if plan.feed_duty > 0.0:
@@ -231,11 +230,7 @@ def test_a_blank_that_is_none_names_its_reactor(tmp_path: Path, content: str, wo
     ("config", "values", "words"),
     [
         (SupplyConfig, {"pump4_ml_s": 0.19}, "backend.supply.pump4_ml_s = 0.19: allowed 0 or 0.2 to 1.5 mL/s"),
-        (
-            SupplyConfig,
-            {"pump3_ml_s": 1.5, "bias_s": 0.1},
-            "pump3_ml_s = 1.5: allowed a flow that gives at most 0.5 mL",
-        ),
+        (SupplyConfig, {"pump3_ml_s": 1.5, "bias_s": 0.1}, "pump3_ml_s = 1.5: allowed .* at most 0.5 mL"),
         (SupplyConfig, {"pump3_ml_s": 1.5, "bias_s": 0.03}, None),
         (SupplyConfig, {"pump4_ml_s": 0.2}, None),
         (ChiBioConfig, {"stale_s": 180.0}, "backend.lost_s = 180.0 s: allowed more than stale_s = 180.0 s"),

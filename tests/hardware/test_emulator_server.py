@@ -463,7 +463,7 @@ def test_it_ends_with_the_process_that_started_it_however_that_ends() -> None:
         (["--speed", "nan"], "speed = nan"), (["--od", "0.3,0.4", "--reactors", "M0"], "od"),
         (["--od", "-1"], "-1"),
         (["--od", "much"], "od = much"), (["--port", "70000"], "port = 70000"),
-        (["--pump-start", "0.7", "0.2"], "pump_start_high_s = 0.2"), (["--host", "203.0.113.1"], "203.0.113.1:0"),
+        (["--pump-start", "0.7", "0.2"], "pump_start_s = [0.7, 0.2]"), (["--host", "203.0.113.1"], "203.0.113.1:0"),
     ],
 )  # fmt: skip
 def test_bad_arguments_give_one_line(arguments: list[str], named: str, capfd: pytest.CaptureFixture[str]) -> None:

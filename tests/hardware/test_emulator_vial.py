@@ -67,7 +67,7 @@ def test_a_zero_or_a_volume_of_0_kills_the_cycle(path: str) -> None:
     ],
 )
 def test_a_spectrometer_at_its_ends(fault: str, value: float, zero: float, raw: float, od: float) -> None:
-    lab = Lab(options=quiet(blank_low=60000.0, blank_high=60000.0), od=0.0)
+    lab = Lab(options=quiet(blank=(60000.0, 60000.0)), od=0.0)
     lab.post(f"/CalibrateOD/OD0/M0/{zero}/0")
     inject(lab.device, fault, "M0", value)
     assert lab.post("/MeasureOD/M0") == 204
@@ -121,7 +121,7 @@ def test_noise_of_a_reading_and_of_the_mean() -> None:
 
 
 def test_blanks_are_in_the_range_seen_on_real_devices() -> None:
-    names, options = tuple(f"M{k}" for k in range(8)), quiet(blank_low=11600.0, blank_high=15800.0)
+    names, options = tuple(f"M{k}" for k in range(8)), quiet(blank=(11600.0, 15800.0))
     labs = [Lab(names, seed=s, options=options) for s in range(5)]
     counts = [v.spectrometer.blank for lab in labs for v in lab.device.vials.values()]
     assert min(counts) >= 11600.0
@@ -224,7 +224,7 @@ def test_off_leaves_what_was_dosed_until_then(target: float, off_s: float, lengt
 
 
 def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
-    lab = Lab(options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    lab = Lab(options=quiet(pump_start_s=(0.2, 0.7)))
     delays = []
     for _ in range(200):
         lab.pump("Pump1", 0.05)
@@ -242,7 +242,7 @@ def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
 def test_the_delay_is_an_option_of_the_program() -> None:
     for arguments, expected in (([], (0.2, 0.7)), (["--pump-start", "0.1", "3"], (0.1, 3.0))):
         vial = build(parser().parse_args(arguments)).options.vial
-        assert (vial.pump_start_low_s, vial.pump_start_high_s) == expected
+        assert vial.pump_start_s == expected
 
 
 @pytest.mark.parametrize("name", groups()["plant"])

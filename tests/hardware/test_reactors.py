@@ -57,7 +57,7 @@ def test_three_reactors_are_held_without_a_missed_or_doubled_minute() -> None:
     assert "undosed" not in lab.kinds()
 
 
-LATE = quiet(pump_start_low_s=0.2, pump_start_high_s=0.7)
+LATE = quiet(pump_start_s=(0.2, 0.7))
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ class Beside:
         assert [page.post(f"/{path}").status for path in BY_PAGE] == [204] * 4
         self.plant = device.vials["M0"].plant
         self.law = registry.build(registry.config("inverse"), model=EnvConfig())
-        reactors = WatchedChiBio(self.link.get, self.clock, "M0", 1.0, 2.0)
+        reactors = WatchedChiBio(self.link.get, self.clock, "M0", 1.0)
         asked = Scenario((0.5,), (1e5,), (37.0,))
         self.loop = ClosedLoop(reactors, self.law, WatchedInterlock(1, SafetyConfig()), asked, at_end="hold")
 

@@ -53,7 +53,7 @@ def test_a_feed_that_fails_is_told_within_half_an_hour_beside_the_vendor_s_regul
         link = HttpTransport(app.url, SPEED)
         patch.setattr(link, "post", pytest.fail)
         law = registry.build(registry.config("inverse"), model=EnvConfig())
-        reactors = WatchedChiBio(link.get, DeviceClock(SPEED), "M0", 1.0, 2.0)
+        reactors = WatchedChiBio(link.get, DeviceClock(SPEED), "M0", 1.0)
         interlock, asked = WatchedInterlock(1, SafetyConfig()), Scenario((0.45,), (1e5,), (37.0,))
         loop = ClosedLoop(reactors, law, interlock, asked, at_end="hold")
         while app.now() < 3600.0:

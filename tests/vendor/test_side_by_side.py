@@ -114,8 +114,7 @@ def named(request: str, m: str) -> str:
 
 def on_emulator(name: str) -> list[Look]:
     """In the emulator's own time, one reactor; every look of the sequence, and one each second before it."""
-    blank = {"blank_low": BLANK, "blank_high": BLANK}
-    lab = Lab(("M0",), options=quiet(0.03, **blank), od=0.45, temperature=30.0, blanked=True)
+    lab = Lab(("M0",), options=quiet(0.03, blank=(BLANK, BLANK)), od=0.45, temperature=30.0, blanked=True)
     lab.post("/MeasureOD/M0")
     lab.wait(30.0)
     began, seen = lab.clock.now(), []
