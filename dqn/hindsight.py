@@ -103,7 +103,7 @@ class ProgramRelabel:
     announcement. After the step the change is one period closer or has happened.
 
     Args:
-      config: uses the keys `hindsight_*`. place, spread: map uniform numbers to x, to setpoints. reward: function (x',
+      config: uses the keys `hindsight_*`. place, spread: uniform numbers -> x, setpoints. reward: function (x',
       setpoint) -> reward. column: index of the setpoint. period: duration of a step. preview: how long ahead a change
       is known, 0: no such columns; both in the unit of the time column. scales: whether a step multiplies x.
     """

@@ -44,7 +44,7 @@ class Replay:
 
     @property
     def size(self) -> int:
-        """Transitions held per agent."""
+        """Number of stored transitions per agent."""
         return min(self.added, self.capacity)
 
     def add(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:

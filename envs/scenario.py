@@ -15,14 +15,14 @@ Mask = NDArray[np.bool_]
 
 LARGEST_OD = 2.0  # largest level of a condition
 COMPARED = re.compile(r"od\s*(>=|<=)\s*(\d*\.?\d+)")
-ENDS = "'od >= 0.8', 'od <= 0.3', settled, or null: its minutes"
+ENDS = "'od >= 0.8', 'od <= 0.3', settled, or null"
 
 PUMPS = (3, 4)  # spare pumps: for a second medium, an inducer or a stressor
 DOSE_ML = 0.5  # smallest dose; pumps of up to 1.5 mL/s deliver this volume reliably (docs/device.md, Pumps)
 MADE_UP_MIN = 5.0  # longest pause of the program or the samples whose volume is delivered later; else it is omitted
 MOST_ML_H, MOST_ML = 20.0, 20.0
 GIVEN = re.compile(r"pump([34])\s+(\d*\.?\d+)\s*(mL/h|mL)", re.IGNORECASE)
-FLUIDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma between, or null"
+FLUIDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at the start), both separated by a comma, or null"
 
 
 def bounds(text: str | None) -> tuple[float, float]:
@@ -84,7 +84,7 @@ def outputs_of(text: str | None) -> tuple[Output, ...]:
         require(low <= amount <= high, "scenario.outputs", repr(text), f"{low:g} to {high:g} {said[3]}")
         found.append(Output(int(said[1]), amount if hourly else 0.0, 0.0 if hourly else amount))
     pumps = [output.pump for output in found]
-    require(len(set(pumps)) == len(pumps), "scenario.outputs", repr(text), "each pump once in a step")
+    require(len(set(pumps)) == len(pumps), "scenario.outputs", repr(text), "each pump at most once in a step")
     return tuple(found)
 
 

@@ -133,7 +133,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     ) -> None:
         if config is None:
             known = {field.name for field in fields(self.default)}
-            build(self.default(), {key: value for key, value in overrides.items() if key not in known})  # refuses any
+            build(self.default(), {key: value for key, value in overrides.items() if key not in known})  # refuses them
             config = self.default(**overrides)
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)

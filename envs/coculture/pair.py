@@ -44,7 +44,7 @@ class SpeciesConfig:
 
     def __post_init__(self) -> None:
         check(self, "pair")
-        require(bool(self.polynomial) != bool(self.cardinal), "pair", self.name, "one of polynomial and cardinal")
+        require(bool(self.polynomial) != bool(self.cardinal), "pair", self.name, "either polynomial or cardinal")
         for key in ("polynomial", "cardinal"):
             given = getattr(self, key)
             require(bool(np.isfinite(given).all()), f"pair, {key} of {self.name}", given, "numbers")

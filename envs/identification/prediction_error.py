@@ -367,7 +367,7 @@ def _mean_growth(batch: _Batch, solved: _Solved, sigma: Array) -> tuple[Array, A
 
 
 def _quantiles(centre: Array, sd: Array, weight: Array, degrees: float) -> Parameter:
-    """Return median and central 95 % of a mixture of Student t distributions, each in STRATA of equal probability."""
+    """Return median and central 95 % of a mixture of Student t distributions; each is replaced by STRATA quantiles."""
     from scipy.special import stdtrit
 
     places = stdtrit(degrees, (np.arange(STRATA) + 0.5) / STRATA)

@@ -238,8 +238,8 @@ def test_warmth_may_make_the_second_gain() -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: SpeciesConfig("x", (), ()), "one of polynomial and cardinal"),
-        (lambda: SpeciesConfig("x", (1.0,), (1.0, 2.0, 3.0, 4.0)), "one of polynomial and cardinal"),
+        (lambda: SpeciesConfig("x", (), ()), "either polynomial or cardinal"),
+        (lambda: SpeciesConfig("x", (1.0,), (1.0, 2.0, 3.0, 4.0)), "either polynomial or cardinal"),
         (lambda: SpeciesConfig("x", (), (5.0, 37.0, 36.0, 1.0)), r"\[t_min, t_opt, t_max, mu_opt\], rising"),
         (lambda: SpeciesConfig("x", (), (5.0, 20.0, 45.0, 1.0)), "t_opt nearer to t_max"),
         (lambda: SpeciesConfig("x", (0.1, float("nan"))), "pair, polynomial of x = .*: allowed numbers"),

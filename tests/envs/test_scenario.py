@@ -38,7 +38,7 @@ def test_a_condition_has_a_level_above_zero_and_up_to_two(text, fits):
     [
         ("pump3 20 mL/h", None), ("pump3 20.1 mL/h", "0.1 to 20 mL/h"), ("pump3 0.1 mL/h, pump4 0.5 mL", None),
         ("pump3 0.09 mL/h", "0.1 to 20 mL/h"), ("pump4 0.49 mL", "0.5 to 20 mL$"), ("pump4 21 mL", "0.5 to 20 mL$"),
-        ("pump3 1 mL, pump3 2 mL/h", "each pump once in a step"), ("pump2 1 mL", "'pump3 2 mL/h', 'pump4 1.5 mL'"),
+        ("pump3 1 mL, pump3 2 mL/h", "each pump at most once"), ("pump2 1 mL", "'pump3 2 mL/h', 'pump4 1.5 mL'"),
         *((text, "'pump3 2 mL/h', 'pump4 1.5 mL'") for text in ("pump3 2", "pump3 2 L", "pump3 -1 mL", "pump3 1 mL,")),
     ],
 )  # fmt: skip
