@@ -21,7 +21,7 @@ class Guest:
     def signals(
         self, config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]
     ) -> list[Signal]:
-        """Build the guest's signals, controlled beside density. Args: scenarios: one per reactor. Raises: as above."""
+        """Build the guest's signals. Args: scenarios: one per reactor. Raises: as `completed`."""
         return []
 
     def vials(self, config: DeployConfig) -> str:
