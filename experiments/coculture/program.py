@@ -26,12 +26,12 @@ class Ratios:
 
     ratios: tuple[float | None, ...] = setting(
         (),
-        "setpoint of the share of B in each phase, null: none; empty: none in any phase",
+        "setpoint of the second species' share in each phase, null: none; empty: none in any phase",
         above=0.0,
         below=1.0,
     )
     ratio_sine: tuple[float, ...] = setting(
-        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
+        (), "setpoint of this share as a sine that first falls: mean, amplitude, period in min; empty: none"
     )
 
     def __post_init__(self) -> None:

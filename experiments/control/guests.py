@@ -25,7 +25,7 @@ class Guest:
         return []
 
     def vials(self, config: DeployConfig) -> str:
-        """Return the plant preset by which `completed` replaced the usual vials; "" for none."""
+        """Return the plant preset that `completed` uses instead of the usual vials; "" for none."""
         return ""
 
     def deciders(self, config: DeployConfig) -> list[tuple[str, str]]:

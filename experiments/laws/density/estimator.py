@@ -68,7 +68,7 @@ class EstimatorConfig:
     growth_cv: float = setting(0.05, "spread of growth within a minute, relative to mu (assumption)", within=(0, 1))
     gate_sigma: float = setting(5.0, "a reading with a larger innovation is an outlier", "sigma", within=(2, 20))
     gate_max: int = setting(
-        6, "agreeing outliers in a row that are accepted; bubbles: up to 5", "readings", within=(1, 20)
+        6, "this many agreeing outliers in a row are accepted; bubbles: up to 5", "readings", within=(1, 20)
     )
     gate_od: float = setting(
         0.025,
