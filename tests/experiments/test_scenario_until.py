@@ -113,7 +113,7 @@ def test_reactors_are_judged_by_their_own_band_minutes_and_number_of_steps() -> 
 
 
 def test_conditions_do_not_go_with_shares_and_need_one_for_each_step() -> None:
-    with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed \[\] where a share is asked for"):
+    with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed \[\] with setpoints of a share"):
         Scenario(until=("settled",), ratios=(0.3,))
     with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed no entry, or one for each of the 1 phases"):
         Scenario(until=("settled", None))
