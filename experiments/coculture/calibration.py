@@ -14,7 +14,7 @@ OD_TERM = CompositionEstimatorConfig().od_term
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """Factor k and offset o (counts) of a reading FL = k (f + 150 OD) + o with their sds; keys of the estimator."""
+    """Factor k and offset o (counts) of a reading FL = k (f + 150 OD) + o, with their sds."""
 
     factor: float
     factor_sd: float

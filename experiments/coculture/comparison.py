@@ -138,7 +138,7 @@ def _beside(config: BenchmarkConfig, name: str) -> Controller:
 
 
 def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
-    """Calibrate the estimator with each reactor's factor and offset, plus random errors of a usual calibration."""
+    """Calibrate the estimator: each reactor's true factor and offset plus the random errors of a usual calibration."""
     rng = np.random.default_rng([seed, 1])
     factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
     offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
@@ -146,7 +146,7 @@ def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
 
 
 def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Return the config with the pair's species in the vials, and a temperature in every phase, by default even_c."""
+    """Return the config with the pair in the vials; phases without a temperature get that of equal growth."""
     pair = read_pair(of_benchmark(config).pair)
     scenarios = {name: resting(s, pair.resting_c) for name, s in config.scenarios.items()}
     plants = {name: of_pair(p, pair) if of_plant(p).second.present else p for name, p in config.plants.items()}

@@ -91,7 +91,7 @@ class CompositionEstimator:
     filters begin at different shares; their weights are the likelihoods of the readings, and the estimate is mean and
     variance of the mixture (Alspach, Sorenson 1972).
 
-    A reading beyond `gate_sigma` is rejected; with an OD reading, the light of that sample is rejected, too. After
+    A reading beyond `gate_sigma` is rejected. If it is an OD, the light of the same sample is not used, either. After
     `gate_max` rejections in a row, OD and pigment (for light: the pigment) are reset, without an effect on the share.
     Doses must be reported. If OD readings show a larger spread of doses than `dose_cv`, the filter uses the larger.
 
@@ -276,7 +276,7 @@ class CompositionEstimator:
         self._produce(idx, minutes, last)
 
     def _produce(self, idx: Rows, minutes: Array, temperature: Array) -> None:
-        """Change the production by the steady production at this temperature minus its own delayed value."""
+        """Update the pigment production: it changes by the steady value at this temperature minus its delayed value."""
         now, past = self._production[idx], self._past[idx]
         pigment, steady = self.pair.pigment, self.pair.production(temperature[:, None] + ERRORS_C)
         wanted = now + pigment.follow_per_h / 60.0 * minutes[:, None] * (steady - past[:, 0])
@@ -395,7 +395,7 @@ class CompositionEstimator:
         return np.asarray((self._weights() * of_starts).sum(axis=1))
 
     def estimate(self) -> ShareEstimate:
-        """Return the estimate of the share and so on; before the first reading, the initial values."""
+        """Return the current estimate; before the first reading it has the initial values."""
         z, mixed = self.mean, self._mixed
         logit, error = mixed(z[..., LOGIT]), mixed(z[..., THERMOMETER])
         variance = mixed(self.cov[..., LOGIT, LOGIT] + np.square(z[..., LOGIT] - logit[:, None]))
@@ -437,7 +437,7 @@ def _square(a: Array) -> Array:
 
 
 def _starts(k: int) -> tuple[Array, float]:
-    """Return positions and width of k starts, in units of the sd that their mixture has."""
+    """Return the positions of k starts, and the sd of each, both in units of the sd of their mixture."""
     if k == 1:
         return np.zeros(1), 1.0
     away = np.linspace(-1.0, 1.0, k)
@@ -446,7 +446,7 @@ def _starts(k: int) -> tuple[Array, float]:
 
 
 def _through(error: Array) -> tuple[Array, Array]:
-    """Return weights that interpolate values at `ERRORS_C` by a polynomial at `error`, degC, and those of its slope."""
+    """Return weights of values at `ERRORS_C` that give the polynomial through them at `error`, degC, and its slope."""
     at = np.clip(error, ERRORS_C[0], ERRORS_C[-1])[..., None]
     powers = np.arange(ERRORS_C.size)
     slope = powers * at ** np.maximum(powers - 1, 0)

@@ -36,7 +36,7 @@ Config = TypeVar("Config", bound=LawConfig)
 
 
 class Periodic(ABC, Generic[Config]):
-    """Base class of controllers that decide at multiples of a period since the program began, with constant targets.
+    """Base class of controllers that decide at multiples of a period since the program began and then keep the target.
 
     Args: pair: the two species. "Colder" in the settings means warmer if the second species gains by warmth.
     """
@@ -101,9 +101,9 @@ class PIConfig(LawConfig):
 
 
 class PI(Periodic[PIConfig]):
-    """The vendor's PI: T = 33.2 - 15 (s - r) - I, I <- I + 0.01 (s - r) each minute, frozen while it pushes at a limit.
+    """The vendor's PI controller: T = 33.2 - 15 (s - r) - I, and I <- I + 0.01 (s - r) each minute.
 
-    T is the measured temperature: the vendor's controller ignores the estimated error of the thermometer.
+    While T is at a limit, I does not grow further. T is the measured temperature, not the estimated true one.
     Source: program `CustomCompControl` of Janmorlock/ChiBio, the device's code for Lee et al. (2025).
     """
 
@@ -188,9 +188,9 @@ class MidpointConfig(InverseDynamicsConfig):
 class Midpoint(InverseDynamics):
     """Controller that is half-way to the next setpoint, in logit, at the time of an announced change.
 
-    It applies the hottest or coldest temperature from the time at which the model predicts this, until the change.
-    Otherwise it acts as `InverseDynamics`. The cost is convex in the error, so the smallest total cost has equal errors
-    before and after the change.
+    It switches to the hottest or coldest temperature when the model predicts that the share then is half-way just at
+    the change, and keeps this temperature until the change. Otherwise it acts as `InverseDynamics`. The cost is convex
+    in the error, so the smallest total cost has equal errors before and after the change.
     """
 
     remembers = ("target", "next", "towards")
@@ -248,7 +248,7 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     then]. The value given for m_p is m_p - (b_e - b) mu_e(33.2), with the estimated error b_e of the first species'
     curve and the error b of the training: this difference changes the share as much as an equal change of m_p.
     A change that is further ahead than in training is not yet given to the policy. The controller may decide more
-    often than in training: it then replaces an action before the period for which Q values it has ended.
+    often than in training; the Q values still assume that an action lasts for a period of the training.
     Args: policy: policy with one of these observations, used for all cultures.
     Raises: ValueError for a policy of another task or pair.
     """
@@ -289,7 +289,7 @@ def _ahead(model: CocultureConfig, setpoints: tuple[float, ...]) -> Array:
 
 
 def _best(model: CocultureConfig, value: Array | None, estimate: ShareEstimate, setpoint: Array) -> Array:
-    """Return the best temperatures: next step with the estimated curves, later costs `value` with the model's."""
+    """Return the best temperatures, with the estimated curves for the next step, and later costs by the model."""
     chosen = best_action(model, transitions(model), value, estimate.state, setpoint, estimate.errors)
     return np.asarray(model.targets()[chosen])
 

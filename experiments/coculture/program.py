@@ -14,9 +14,8 @@ from experiments.coculture.base import Array, Wanted
 ANNOUNCED_MIN = 360.0  # default time by which a change of the share's setpoint is announced before it happens
 
 SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4
-"""A sine is announced as a step: to its share SINE_LEAD_MIN ahead, in SINE_STEP times SINE_LEAD_MIN minutes
-(docs/coculture.md, Composition controllers).
-"""
+"""For a sine, the controller always receives the share SINE_LEAD_MIN ahead as a change that happens in SINE_STEP
+times SINE_LEAD_MIN minutes."""
 
 
 class Ratios:
@@ -27,12 +26,12 @@ class Ratios:
 
     ratios: tuple[float | None, ...] = setting(
         (),
-        "setpoint of the share of B in each phase, null: none; empty: none in any phase",
+        "setpoint of the second species' share in each phase, null: none; empty: none in any phase",
         above=0.0,
         below=1.0,
     )
     ratio_sine: tuple[float, ...] = setting(
-        (), "setpoint of the share of B as a sine, falling first: mean, amplitude, period in min; empty: none"
+        (), "setpoint of this share as a sine that first falls: mean, amplitude, period in min; empty: none"
     )
 
     def __post_init__(self) -> None:
@@ -105,8 +104,8 @@ class Program(Phased):
     def wanted(self, minute: Array, preview_min: float = 0.0) -> Wanted:
         """Return the setpoints that a controller receives at each minute since the program began, (N,).
 
-        Args: preview_min: time by which a change from one share to another is announced; 0: never. A sine is announced
-          as a step to its share 300 min ahead, in 120 min; for `preview_min` < 300 both times are shorter.
+        Args: preview_min: how long before a change from one share to another it is announced; 0: never. For a sine, the
+          share 300 min ahead is announced as a change in 120 min; a `preview_min` below 300 shortens both times.
         """
         now = self.setpoint(minute)
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)

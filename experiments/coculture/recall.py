@@ -118,7 +118,7 @@ class Recall:
         return True
 
     def retell(self, shown: Iterable[Shown]) -> None:
-        """Replay calls from before a resume and after `known`, in order; until then the estimate is the saved one."""
+        """Replay the calls since `known` of a resumed run; until this is complete, the estimate is the saved one."""
         self._forget()
         last = self.known
         for minute, method, arguments in shown:

@@ -172,7 +172,7 @@ class Share:
         return lines
 
     def _stuck(self, share: Array, goal: Array, inside: Mask, minute: Array, believed: Mask) -> Mask:
-        """Return which shares are stuck, (N,): nearing neither goal, (2, N): current setpoint and announced one."""
+        """Return which shares are stuck, (N,): they approach neither goal. goal: current and announced one, (2, N)."""
         rows, away = believed & np.isfinite(goal), goal - share
         same = np.abs(goal - self._goal) <= OTHER
         well = rows & (inside | ~(np.abs(away) > self.warnings.far) | ~same)

@@ -83,11 +83,11 @@ class Coculture:
         )
 
     def selection_grid(self) -> Array:
-        """Return starts between the reported ones: 8 shares x 8 setpoints; with preview, changes between setpoints."""
+        """Return the starts that select a policy: 8 shares x 8 setpoints; with preview, one per change of setpoint."""
         return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.06, 0.94, 8))
 
     def report_grid(self) -> Array:
-        """Return the reported starts: 19 shares x 9 setpoints; with preview, changes between each two setpoints."""
+        """Return the starts that score a policy: 19 shares x 9 setpoints; with preview, one per change of setpoint."""
         return self._grid(np.linspace(0.1, 0.9, 9), np.linspace(0.05, 0.95, 19))
 
     def _grid(self, setpoints: Array, starts: Array) -> Array:

@@ -66,7 +66,7 @@ class BenchmarkConfig:
             given = *scenario.until, *scenario.outputs
             require(not any(given), f"scenarios.{name}", given, "no until and no outputs in a comparison")
         met = any(TWIN in study.plants for study in self.studies.values())
-        wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
+        wanted = f"null, or a study that uses it: studies.NAME.plants=[nominal,{TWIN}]"
         require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)
 
 

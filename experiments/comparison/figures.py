@@ -67,7 +67,7 @@ def _band(ax: Axes, time: Array, values: Array, colour: str) -> None:
 
 
 def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
-    """Return minutes (K,), OD, pump rate, temperature (N, K); a long scenario: block means, noise-free OD."""
+    """Return minutes (K,), OD, pump rate, temperature (N, K); for a long scenario block means with noise-free OD."""
     last = trial.minute.size - 1
     if trial.schedule.total_min <= LONG_MIN:
         return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]

@@ -171,7 +171,7 @@ def matrix(
     """Tabulate entries, one row per plant and one column per controller; mark each plant's lowest, except the oracle.
 
     Args: text: function that formats an entry as a cell. ranked_by: key that decides the lowest. floor: function that
-      formats the score of the sensor's noise, a last column. laws_down: one row per controller, one column per plant.
+      formats the score of the sensor's noise for a last column. laws_down: one row per controller, a column per plant.
     """
     laws = list(dict.fromkeys(map(law_of, entries)))
     body = []

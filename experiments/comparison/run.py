@@ -94,7 +94,7 @@ def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
 
 
 def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
-    """Replace a learned controller whose policy is a folder of seeds by one per seed. Raises: frame.UserError."""
+    """Replace each learned controller whose policy is a folder of several seeds by one controller per seed."""
     for name, where in config.policies.items():
         if name not in config.controllers or config.controllers[name].kind != "dqn":
             known = [n for n, c in config.controllers.items() if c.kind == "dqn"]

@@ -45,7 +45,7 @@ class Spread:
 
 
 def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
-    """Build a row of summary.json: metrics of the measured OD (T = 1 min), means; the settling time is a median."""
+    """Build a row of summary.json: mean metrics of the measured OD (T = 1 min), and the median settling time."""
     score = trial.score(window)
     of = {metric: Spread(getattr(score, metric)) for metric in METRICS}
     columns = [(m, part) for parts in (("mean", "sd"), ("median",), ("ci95",)) for m in METRICS for part in parts]

@@ -86,7 +86,7 @@ class Window:
 
 
 def windows(schedule: Scenario) -> list[Window]:
-    """List the phases of a schedule, labelled by setpoint, temperature or hours: the first that differs in all."""
+    """List the phases of a schedule. Labels: setpoints, or temperatures, or hours; the first that has no repetition."""
     edges = schedule.edges
     by_setpoint = [f"{s:g}" for s in schedule.setpoints]
     by_temperature = [f"{t:g}" for t in schedule.temperatures]
@@ -169,7 +169,7 @@ def closed(
 
 
 def record(loop: ClosedLoop, seen: Callable[[Step], Mapping[str, Array]]) -> tuple[Array, dict[str, Array]]:
-    """Run a loop; return minutes of its schedule, (K,), and values, name -> (N, K). Args: seen: values of a step."""
+    """Run a loop; return the minutes of its schedule, (K,), and the values that `seen` returns, name -> (N, K)."""
     schedule, every_min = loop.schedules[0], loop.interlock.bench.control_min
     minute = np.arange(0.0, schedule.total_min + 1e-6, every_min)
     stored: dict[str, Array] = {}

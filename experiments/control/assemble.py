@@ -56,7 +56,7 @@ class Setup:
     model: growth model for model-based controllers: calibrated if a file is given, else nominal.
     law: config of the pump rate's controller. wanted: policy that controller=dqn asks for; None for other controllers.
     policy: the loaded policy; None for a preflight. bounds: from its certificate.
-    further: signals controlled beside the density, new, without readings.
+    further: the signals other than the density, without readings yet.
     fsync: whether each row is forced to disk. title: controller and plant of the run. row: the run's parameters in
       TensorBoard's HPARAMS table. resumed: whether this run continues an earlier one.
     """
@@ -199,7 +199,7 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
 
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
-    """Build the signals controlled beside the density. Raises: UserError if scenario or backend does not fit them."""
+    """Build the signals other than the density. Raises: UserError if scenario or backend does not fit them."""
     with frame.refusing(ValueError, ReactorError):
         family, made = family_of(config.backend), []
         for guest in GUESTS:

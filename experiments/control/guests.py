@@ -21,11 +21,11 @@ class Guest:
     def signals(
         self, config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]
     ) -> list[Signal]:
-        """Build the guest's signals, controlled beside density. Args: scenarios: one per reactor. Raises: as above."""
+        """Build the guest's signals. Args: scenarios: one per reactor. Raises: as `completed`."""
         return []
 
     def vials(self, config: DeployConfig) -> str:
-        """Return the plant preset by which `completed` replaced the usual vials; "" for none."""
+        """Return the plant preset that `completed` uses instead of the usual vials; "" for none."""
         return ""
 
     def deciders(self, config: DeployConfig) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Messages of `deploy`: at the start of a run, of marks, of its hook, and at its end."""
+"""Messages of `deploy`: about its policy and config, measurements by users, notifications, and the end of a run."""
 
 from conf.messages import Message
 from experiments.cli.words import UserError

@@ -33,7 +33,7 @@ FORCE = "to run it nevertheless, add force_policy=true"
 
 
 class NoPolicyError(frame.UserError):
-    """`policy=latest` without a training run."""
+    """`policy=latest` is set, but there is no training run."""
 
 
 @dataclass(frozen=True)

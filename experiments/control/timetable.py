@@ -29,13 +29,13 @@ class Expected:
 
 
 def _reaches(od: float, level: float, growth: float, dilution: float) -> float:
-    """Return the minutes that undiluted growth up, or full dilution down, takes from OD `od` to `level`; inf: never."""
+    """Return the minutes from OD `od` to OD `level` by undiluted growth or by full dilution; inf: never."""
     rate = growth if level > od else dilution - growth
     return 0.0 if level == od else math.log(max(level, od) / min(level, od)) / rate if rate > 0.0 else math.inf
 
 
 def _fed_ml(minutes: float, reached: float, down: bool, growth: float, dilution: float, volume_ml: float) -> float:
-    """Return the medium that a step of `minutes` needs, mL: full dilution down or no dose up, then growth balanced."""
+    """Return the medium that a step of `minutes` needs, mL. reached: minutes to the setpoint. down: by dilution."""
     held = max(minutes - reached, 0.0) * growth
     return volume_ml * (held + (min(minutes, reached) * dilution if down else 0.0))
 

@@ -63,7 +63,7 @@ class Accounts(Protocol):
 
 
 class Speeds(Protocol):
-    """Estimates of how fast the OD of a culture can rise and fall (`experiments/laws/density/estimators.py`)."""
+    """Estimator of how fast the OD of a culture can rise and fall (`experiments/laws/density/estimators.py`)."""
 
     @property
     def full_pump(self) -> Array:
@@ -90,5 +90,5 @@ class Watches(Protocol):
 
 
 def usable(od: Array, rows: Mask) -> Mask:
-    """Return the rows with a new reading that is a number."""
+    """Return whether each row has a new reading that is not nan, (N,)."""
     return np.asarray(rows & np.isfinite(od))

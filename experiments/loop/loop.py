@@ -73,7 +73,7 @@ class Step:
 class ClosedLoop:
     """Closed loop of N reactors with signals, interlock and schedules. Reactors may be sampled at different times.
 
-    Each reactor first recovers: it grows to `recovery_od`, or beyond and is diluted to it. Then its schedule begins.
+    Each reactor first recovers: it grows to `recovery_od`, or beyond and is diluted to it. Then the schedule begins.
     A reading that the interlock rejects starts no schedule and is not shown to the controller.
 
     Args:
@@ -83,7 +83,7 @@ class ClosedLoop:
         (keep the last setpoint), "stop" (no more doses) or "regulate" (hand over to the device's own regulation).
       before_dose: function that receives each decided step before any dose; it writes the journal.
       scale: volume of each culture divided by that of the controller's model, as in `Density`.
-      further: signals beside the density. The command of a signal replaces that of the schedule.
+      further: signals other than the density. The command of a signal replaces that of the schedule.
       actuators: all actuators of the reactors.
       model: growth model of an estimator that is added if changes are announced and the controller has no estimator.
     Raises: ValueError if the numbers of schedules and reactors differ, if two signals use the same actuator, or if a
@@ -214,7 +214,7 @@ class ClosedLoop:
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
 
     def _commands(self, sample: Sample) -> dict[str, Array]:
-        """Let the signals beside the density decide; return actuator -> command within the interlock's limits."""
+        """Let all signals except the density decide; return actuator -> command within the interlock's limits."""
         commands: dict[str, Array] = {}
         for signal, actuator in self._commanded:
             asked = shaped(signal.decide(sample), len(self.done), f"signal {signal.name}: what decide returns")

@@ -64,7 +64,7 @@ class Progress:
         return np.where(minute >= 0.0, np.minimum(index, self._counts - 1), -1).astype(np.intp)
 
     def asked(self, elapsed: Array) -> tuple[Phases, Array, Array]:
-        """Return step, setpoint and temperature of each reactor, (N,) each; before the start: of the first step."""
+        """Return each reactor's step (-1 before the start), setpoint and temperature (then of the first step), (N,)."""
         phase = self.phase(elapsed)
         at = np.arange(phase.size), np.maximum(phase, 0)
         return phase, self._setpoints[at], self._temperatures[at]
@@ -124,7 +124,7 @@ class Progress:
         return np.asarray(np.abs(od - setpoint) <= self._band * setpoint)
 
     def steps(self, n: int) -> list[tuple[float, float, str]]:
-        """List start, end and reason of the end of reactor n's steps; future steps as if no condition were met."""
+        """List reactor n's steps: start, end, and why it ended; future steps are listed with their longest time."""
         edges = self.edges[n, : self._counts[n] + 1]
         early = np.diff(edges) < self._minutes[n, : self._counts[n]] - 1e-6
         why = [CONDITION if e else TIME for e in early]

@@ -148,9 +148,9 @@ class Counted(Protocol):
         """Use a value counted in a sample of reactor n, and its sd; return the outcome. Args: minute: of the sample."""
 
     def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
-        """Replay data from before a resume. Args: rows: recorded columns of each reactor. counted: all samples.
+        """Replay data from before a resume.
 
-        light: lowest and highest valid counts of fluorescence.
+        Args: rows: recorded columns of each reactor. counted: all samples. light: range of valid fluorescence counts.
         """
 
 
@@ -260,7 +260,7 @@ def add(name: str, make: Make) -> None:
 
 
 def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
-    """Build a signal of an extension. Raises: ValueError for an unknown signal, or from its own `make`."""
+    """Build a signal of an extension. Raises: ValueError for an unknown signal; others from the signal's `make`."""
     if name not in MAKERS:
         raise messages.NoSuchSignal(name=name, known=", ".join(MAKERS) or "those of extend=FILE.py")
     return MAKERS[name](config, schedules)

@@ -1,4 +1,4 @@
-"""Figures of a calibration: measurement and model, drift, coverage; comparison of a run with its model."""
+"""Figures of a calibration (measurement and model, drift, coverage), and of the comparison of a run with its model."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,8 +22,8 @@ ESTIMATOR, MARK = PUMP, REJECTED
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
     """Draw three charts: measured OD with the fitted model, the model's errors, and the pump rate.
 
-    Method prediction_error: one-step predictions and innovations; a dashed line shows the free run of the same pair.
-    Method free_run: the simulation without feedback from readings, and its residuals.
+    For method prediction_error it draws one-step predictions and innovations; a dashed line shows the free run of the
+    same pair. For method free_run it draws a simulation that uses no readings after the start, and its residuals.
     Args: raw: the recording before screening, with the same rows as in `result`. result: as `calibrate` returns.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
@@ -139,7 +139,7 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
 def _alone(ax: Axes, spans: Sequence[tuple[float, float]], found: Sequence[Parameter | None]) -> Array:
     """Draw the estimates of separately fitted segments; return middle time (h), value, low, high of each, (4, K).
 
-    Args: spans: middle and half length of each segment, h. found: its estimate; None, if it has none, is not drawn.
+    Args: spans: middle and half length of each segment, h. found: estimate of each segment, or None.
     """
     known = [(*span, p.value, p.low, p.high) for span, p in zip(spans, found, strict=True) if p is not None]
     middle, across, value, low, high = np.array(known).reshape(-1, 5).T

@@ -15,7 +15,7 @@ POPULATION = {"iqm": "mean of the middle half of the agents", "min": "lowest age
 
 @dataclass(frozen=True)
 class Curve:
-    """Unit ("" for a number without unit) and description of a tag."""
+    """Description of a tag. unit: unit of its values, "" for none. what: meaning of its values."""
 
     unit: str
     what: str
@@ -150,7 +150,7 @@ PAGES: dict[str, Mapping[str, Mapping[str, Chart]]] = {}
 
 
 def signals_in(windows: Sequence[Mapping[str, object]]) -> list[str]:
-    """List the columns of all signals other than density that had a setpoint in a window. Args: of a summary."""
+    """List the columns of all signals, other than density, that have a setpoint in any window of a summary."""
     ends = [key for window in windows for key in window if key.endswith("_setpoint")]
     return list(dict.fromkeys(key.removesuffix("_setpoint") for key in ends))
 
@@ -201,6 +201,6 @@ def add(
     metrics: Mapping[str, str],
     pictures: Mapping[str, str],
 ) -> None:
-    """Register a guest's entries. Args: added to `ERROR_UNITS`, `CURVES`, `COLUMNS`, `CALLED`, `PAGES` and so on."""
+    """Register a guest's entries. Args: new entries of `ERROR_UNITS`, `CURVES`, `COLUMNS`, `CALLED`, `PAGES` etc."""
     for known, more in zip(TABLES, (units, curves, columns, called, pages, metrics, pictures), strict=True):
         known.update(more)

@@ -125,7 +125,7 @@ def _of_windows(summary: Mapping[str, Any]) -> dict[str, list[float]]:
 def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[str, str]]:
     """Pool finished jobs over seeds, the best configuration first; return also the overrides that all jobs share.
 
-    The best has the smallest worst-seed objective; without objectives, the smallest worst value of the first measure.
+    The largest value of the first measure decides the order; the first measure is the objective, if there is one.
     """
     keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if key.rpartition(".")[2] != "seed"))
     done = [job for job in jobs if job.state == "finished"]

@@ -192,7 +192,7 @@ class PopulationWriter:
 
     @property
     def agents(self) -> Sequence[Events]:
-        """Event writer of each agent's own curves; empty for more than `MOST_CURVES` agents."""
+        """One event writer per agent, for the agent's own curves; empty for more than `MOST_CURVES` agents."""
         return self._agents if len(self._seeds) > 1 else [self.events]
 
     def _rows_until(self, step: int) -> list[list[str]]:

@@ -95,5 +95,5 @@ def results(writer: PopulationWriter, step: int, kept: Score, task: Task, seeds:
     limits = ("limit", f"{task.regret_unit:g}", f"{task.steady_unit:g}")
     pairs = zip(seeds, kept.regret_pct, kept.steady_abs_error, strict=True)
     rows = [(f"seed {seed}", f"{regret:.3f}", f"{steady:.4f}") for seed, regret, steady in pairs]
-    columns = ("policy", "regret, %", f"error at rest, worst setpoint, {task.unit}")
+    columns = ("policy", "regret, %", f"steady error, worst setpoint, {task.unit}")
     writer.events.text("run/summary", tables.markdown(columns, [limits, *rows]), step)

@@ -191,7 +191,7 @@ def test_a_deployment_has_the_plant_of_the_file(file: str, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["env_file=calibrated.yaml"], "env_file = calibrated.yaml: allowed null beside plant_file"),
+        (["env_file=calibrated.yaml"], "env_file = calibrated.yaml: allowed null with plant_file"),
         (["backend=chibio"], "backend.kind = chibio: allowed sim with plant_file"),
     ],
 )

@@ -68,7 +68,7 @@ class EstimatorConfig:
     growth_cv: float = setting(0.05, "spread of growth within a minute, relative to mu (assumption)", within=(0, 1))
     gate_sigma: float = setting(5.0, "a reading with a larger innovation is an outlier", "sigma", within=(2, 20))
     gate_max: int = setting(
-        6, "agreeing outliers in a row that are accepted; bubbles: up to 5", "readings", within=(1, 20)
+        6, "this many agreeing outliers in a row are accepted; bubbles: up to 5", "readings", within=(1, 20)
     )
     gate_od: float = setting(
         0.025,
@@ -98,8 +98,8 @@ def fixed() -> dict[str, Any]:
 class Estimator:
     """Kalman filter with state z = [ln x, mu, g, w] for N vials.
 
-    x is OD, mu the growth rate at the first temperature T0, g the relative pump gain, w = dmu/dT. After a dose of V mL
-    and dt minutes, with the nominal volume 60 tau of the model (tau for a pump of 1 mL/s):
+    x is OD, mu the growth rate at the first temperature T0, g the relative pump gain, w = dmu/dT. With the model's
+    nominal volume 60 tau (for a pump of 1 mL/s), a dose of V mL and dt minutes change the state by
 
       ln x <- ln x + dt (mu + w (T - T0)) - g V/(60 tau),   mu and g random walks,   y = ln(reading) = ln x + noise
 
@@ -295,9 +295,9 @@ class Estimator:
         return np.sqrt(self.cov[:, LOG_OD, LOG_OD]) / self.full_pump, np.sqrt(np.maximum(variance, 0.0))
 
     def sd(self, setpoint: Array) -> tuple[Array, Array]:
-        """Return the standard deviations for the user: e with the uncertainty of B, both scaled by recent innovations.
+        """Return the sd of e and s that are reported to the user, (N,) each; both grow with recent innovations.
 
-        The sd of s refers to the growth share at rest, so it includes SHARE_SD.
+        The sd of e includes the uncertainty of B. The sd of s refers to the growth share at rest and includes SHARE_SD.
         """
         _, share = self.doubt(setpoint)
         slope = np.zeros((len(share), 4))

@@ -98,9 +98,9 @@ class RelativeController:
     The supervisor (docs/certificate.md, The supervisor) replaces the policy by the one-line controller
     u = u_max clip(e + s, 0, 1), with e and s of a second filter with fixed settings, in two cases. 1: twice the sd of e
     or s exceeds the bounds of the certificate. 2: the innovations of the policy's filter are far too large, or far too
-    small for a long time, and those of the second filter are not. In case 1 the error of s is the largest possible
-    distance between true and observed s, for a true s from 0 to the highest proven s; no pump rate holds a culture
-    above that.
+    small for a long time, and those of the second filter are not. Case 1 compares the largest distance of the true s
+    from the s that the policy observes; the true s is between 0 and the highest proven s, above which no pump rate
+    holds a culture.
 
     Args: policy: policy that observes (error, growth_share). estimator: config of its estimator. model: control period,
       largest pump rate, and the initial mu and tau of both filters. bounds: from the certificate; None: only case 2.

@@ -66,7 +66,7 @@ class Problem:
     penalty: float
 
     def factors(self, v: Array) -> tuple[Array, Array]:
-        """Return f(u_max v) and df/dv, each with the shape of v; in closed form, which is fast."""
+        """Return f(u_max v) and df/dv, each with the shape of v."""
         m = self.model
         h = m.control_min / m.substeps
         slope = -h * m.max_pump_rate / m.tau

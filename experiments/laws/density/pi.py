@@ -18,7 +18,9 @@ class ChiBioPIConfig(ControllerConfig):
     """Settings of the device's controller; its gains are constants of the device's code."""
 
     kind: str = setting("pi", "controller")
-    max_pump_rate: float = setting(MAX_PUMP_RATE, "limit, as on the device", "mL/s", above=0.0, at_most=0.05)
+    max_pump_rate: float = setting(
+        MAX_PUMP_RATE, "largest pump rate, as on the device", "mL/s", above=0.0, at_most=0.05
+    )
 
 
 class ChiBioPI:
