@@ -524,7 +524,7 @@ def test_a_policy_of_a_share_sees_the_edge_of_what_its_task_trains() -> None:
     assert (task.actions[0], task.actions[-1]) == (30.0, 34.0)
     assert task.model()["control_min"] == task.model()["model"]["control_min"] == 20.0
     assert task.description == (
-        "shares of two species by temperature, a decision every 20 min, the next setpoint known 60 min ahead"
+        "composition of two species by temperature, a decision every 20 min, setpoints announced 60 min ahead"
     )
     assert (task.regret_unit, Coculture(CocultureConfig()).regret_unit) == (5.0, 0.5)
     assert DensityTask(EnvConfig(control_min=2.5)).model()["control_min"] == 2.5
@@ -730,5 +730,5 @@ def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_re
     with pytest.raises(UserError, match="far enough"):
         train_run.train(replace(config, resume="latest"), tmp_path)
     assert train_run.Session.call_args.args[0].env == config.env  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"pair = bs\.yaml: allowed null for .*; give env=coculture"):
+    with pytest.raises(ValueError, match=r"pair = bs\.yaml: allowed null for .*; .*env=coculture"):
         TrainConfig(pair="bs.yaml", agent=SMALL)
