@@ -205,7 +205,7 @@ def _given(path: Path, total: Array, cells: Cells) -> Array:
 
 
 def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, notes: list[str]) -> tuple[Array, Array]:
-    """Read a table of doses; return minutes on the readings' clock, and mL, by time. Raises: RecordingError."""
+    """Read a table of doses; return minute (clock of the readings) and mL of each, by time. Raises: RecordingError."""
     layout, read = _loaded(path, text.DOSED, asked._replace(time_unit=None), notes, doses=True)
     keep = np.ones(len(read.width), dtype=np.bool_)
     if reactor is not None and "reactor" in layout.labels:
