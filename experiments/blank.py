@@ -26,8 +26,8 @@ class BlankConfig:
     backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
     reactor: str | None = setting(None, "reactor position; null: those of backend.reactors", choices=POSITIONS)
     warm_up: float = setting(90.0, "longest time for the medium to reach its temperature", "min", within=(0, 600))
-    tolerance: float = setting(1.0, "largest difference to the thermostat's target", "degC", within=(0.2, 15))
-    samples: int = setting(6, "number of averaged readings", "min", within=(3, 60), note="one a minute")
+    tolerance: float = setting(1.0, "largest allowed difference from the thermostat's target", "degC", within=(0.2, 15))
+    samples: int = setting(6, "time over which readings are averaged", "min", within=(3, 60), note="one a minute")
 
     def __post_init__(self) -> None:
         check(self)

@@ -38,7 +38,7 @@ class CalibratePairConfig:
     second: tuple[str, ...] = setting((), "recordings of the second species, whose pigment is measured")
     names: tuple[str, ...] = setting(("first", "second"), "names of the two species in figures")
     mixed: str | None = setting(
-        None, "recording of a deployment with both; the marked shares of its run correct both curves"
+        None, "recording of a deployment with both species; the marked shares of its run correct both curves"
     )
     pump_ml_s: float = setting(0.02, "flow at pump rate 1 in a Chi.Bio's own CSV", "mL/s", above=0.0, at_most=1.0)
     volume_ml: float = setting(Bench.volume_ml, "culture volume of all these recordings", "mL", within=(1, 2000))
@@ -48,7 +48,7 @@ class CalibratePairConfig:
     )
     least_min: float = setting(60.0, "shortest time at one temperature after settle_min", "min", within=(30, 2000))
     lags_min: tuple[float, ...] = setting((2.0, 60.0), "time constants of growth after a change of temperature", "min")
-    factor: float = setting(0.99, "factor of light = factor (pigment + od_term OD) + offset", within=(0.05, 20))
+    factor: float = setting(0.99, "factor in light = factor (pigment + od_term OD) + offset", within=(0.05, 20))
     offset: float = setting(214.0, "offset of the light", "counts", within=(0, 20_000))
     od_term: float = setting(150.0, "light scattered by cells of both species", "counts/OD", within=(0, 5000))
 
@@ -110,7 +110,7 @@ def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfi
     lit = [(p, p.light.value) for p in points if p.light is not None]
     if not lit:
         where = ", ".join(config.second)
-        raise frame.UserError(f"second={where}: the recording has no fluorescence; record with backend.fluorescence")
+        raise frame.UserError(f"second={where}: no fluorescence; record with backend.fluorescence.measure=true")
     if dark := [p for p, light in lit if light <= 0.0]:
         at = f"second: light at {dark[0].temperature:.1f} degC is not above offset={config.offset:g} counts"
         raise frame.UserError(f"{at}; check that these are recordings of the second species, and the sensor's offset")

@@ -48,7 +48,7 @@ class CalibratePumpConfig:
     pump: str = setting("feed", "pump to weigh", choices=tuple(PUMP_OF))
     duties: tuple[float, ...] = setting(
         (0.006, 0.01, 0.02, 0.04),
-        "on-times to weigh, as fractions of 63 s: two or more, 0.003 to 0.05 (feed) or to 0.5 (waste), as in later use",
+        "on-times to weigh, as fractions of 63 s: two or more of the later sizes, 0.003 to 0.05 (feed) or 0.5 (waste)",
     )
     doses: int = setting(20, "doses per weighing", within=(3, 200))
     csv: str | None = setting(None, "file of existing weighings, columns duty,doses,grams; with it no pump runs")
@@ -74,7 +74,7 @@ def read_weighings(path: Path) -> list[Weighing]:
         try:
             series = Weighing(float(row["duty"]), int(row["doses"]), float(row["grams"]))
             if not (0.0 < series.duty <= 1.0 and series.doses >= 1 and 0.0 <= series.grams < 10_000.0):
-                raise ValueError("duty 0 to 1, doses at least 1, grams at least 0")
+                raise ValueError("allowed duty 0 to 1, doses at least 1, grams at least 0")
         except (KeyError, TypeError, ValueError) as error:
             raise frame.UserError(f"csv={path}, line {number}: {error}; columns duty,doses,grams") from None
         found.append(series)

@@ -28,7 +28,7 @@ class MarkConfig:
     reactor: str = setting("", "reactor position or unit; '': all")
     text: str = setting("inoculated", "event, in one line of at most 80 characters")
     level_ml: float | None = setting(
-        None, "volume read from the vial; a running deployment sets its ledger and the unit's own to it", "mL",
+        None, "volume read from the vial; a running deployment sets its ledger and the unit's ledger to it", "mL",
         within=(0, 40),
     )  # fmt: skip
     share: float | None = setting(
@@ -56,7 +56,7 @@ class MarkConfig:
         require(self.sd is None or self.share is not None, "sd", self.sd, "null, or together with share=SHARE")
         measured = [key for key in ("level_ml", "share", "bottle_ml") if getattr(self, key) is not None]
         if measured:
-            require(bool(self.reactor), "reactor", repr(self.reactor), f"the reactor of {measured[0]}")
+            require(bool(self.reactor), "reactor", repr(self.reactor), f"a reactor, because {measured[0]} is given")
         if self.bottle_ml is not None:
             require(measured == ["bottle_ml"], "bottle_ml", self.bottle_ml, "alone; mark the other value separately")
             require(self.minute is None, "minute", self.minute, "null with bottle_ml, which applies now")

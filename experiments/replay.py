@@ -50,7 +50,7 @@ class ReplayConfig(Source):
         None, "setpoint of the controller; null: the median OD at which the device dosed", "OD", within=(0.02, 1.5)
     )
     env_file: str | None = setting(None, "growth model of the controller: a calibrated.yaml, or `latest`")
-    bench: Bench = part(Bench, "volume of the vial and largest feed rate; the readings give the period")
+    bench: Bench = part(Bench, "volume of the vial and largest feed rate; the period is that of the readings")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
     identify: IdentifyConfig = part(IdentifyConfig, "fit of the recording's twin, a simulated vial for a closed loop")
 

@@ -33,7 +33,7 @@ class ScoreConfig:
 
     policy: str = setting("", "a policy.npz, a run folder, `latest`, or module:function of a file in this folder")
     env: Any = part(EnvConfig, "the task", env_schema)
-    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: the newest of calibrate; replaces env")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env")
     onnx: str | None = setting(None, "FILE.onnx: also write the network of a policy.npz there")
 
     def __post_init__(self) -> None:

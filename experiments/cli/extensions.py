@@ -58,7 +58,7 @@ def _load(path: Path) -> None:
     if path.suffix != ".py" or not path.is_file():
         raise ValueError(f"extend={path}: no such Python file; give the file that registers your extension")
     if not module.isidentifier() or module in sys.modules:
-        raise ValueError(f"extend={path}: {module} is no name for a new module, or in use; rename the file")
+        raise ValueError(f"extend={path}: the module name {module} is invalid or in use; rename the file")
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"extend={path}: not a Python file")

@@ -144,4 +144,4 @@ class Search(Sweeper):
         best = min(done, key=lambda t: t.value)
         values = [line.removeprefix("++") for line in self._values(best)]
         files.write_json(self.folder / "best.json", {"trial": best.number, "objective": best.value, "values": values})
-        log.info("best of %d trials: %d with objective %.4g: %s", len(done), best.number, best.value, " ".join(values))
+        log.info("trial %d is the best of %d: objective %.4g, %s", best.number, len(done), best.value, " ".join(values))

@@ -81,7 +81,7 @@ class ChangeLog:
         self.notes(step.now_s, step.notes)
 
     def notes(self, now_s: float, notes: Sequence[str]) -> None:
-        """Log notes; repeat a note only after an hour or when its largest number has doubled. Numbers may differ."""
+        """Log notes; repeat a note, whatever its numbers, only after an hour or when its largest number has doubled."""
         for note in notes:
             kind, largest = NUMBER.sub("#", note), max(map(float, NUMBER.findall(note)), default=0.0)
             told_s, before = self._noted.get(kind, (-np.inf, 0.0))

@@ -212,7 +212,7 @@ def _choose_run(path: Path, runs: Sequence[_Run], number: Numbers, run: int | No
 
 
 def _backward(path: Path, table: Cells, highest: float) -> Mask:
-    """Return a mask, (n,), of rows with a backward pump. Raises: RecordingError for too many, or an impossible rate."""
+    """Return a mask, (n,), of rows whose pump ran backwards. Raises: RecordingError: too many, or impossible rates."""
     pump_rate, backward = table.pump_rate, table.pump_rate < 0.0
     few = backward.mean() <= LOST_SHARE
     wrong = (pump_rate > highest) | (backward & ~few)

@@ -67,7 +67,7 @@ def read_table(path: Path, doses: Path | None, asked: Asked, notes: list[str]) -
             f"{path}: {found_all if asked.rows == (0, None) else of_rows}; at least {MIN_ROWS} are needed"
         )
     if doses is not None and layout.feed:
-        raise RecordingError(f"{path}: has a feed, and doses={doses} has it, too; drop one of the two")
+        raise RecordingError(f"{path}: has doses or a pump rate already; drop doses={doses}")
     table, since_1970 = _in_house_units(path, layout, read, keep, notes)
     events = None
     if layout.timed and layout.feed != "rate" and (np.diff(table.time_min) >= 0.0).all():
@@ -198,14 +198,14 @@ def _given(path: Path, total: Array, cells: Cells) -> Array:
     again = np.diff(cells.time_min, prepend=-np.inf) <= 0.0  # another run
     if (falls := (given < -1e-9) & ~again).any():
         raise RecordingError(
-            f"{path}: row {cells.number[np.argmax(falls)]}: the total feed falls, which is impossible; if these are "
-            "single doses, name the column dose_ml; of two runs in one file choose one by rows=FIRST:END"
+            f"{path}: row {cells.number[np.argmax(falls)]}: the total feed falls, which is impossible; name the column "
+            "dose_ml if these are single doses, or choose one of two runs by rows=FIRST:END"
         )
     return np.where(again, 0.0, given)
 
 
 def _events(path: Path, asked: Asked, reactor: str | None, since_1970: bool, notes: list[str]) -> tuple[Array, Array]:
-    """Read a table of doses; return minutes on the readings' clock, and mL, by time. Raises: RecordingError."""
+    """Read a table of doses; return minute (clock of the readings) and mL of each, by time. Raises: RecordingError."""
     layout, read = _loaded(path, text.DOSED, asked._replace(time_unit=None), notes, doses=True)
     keep = np.ones(len(read.width), dtype=np.bool_)
     if reactor is not None and "reactor" in layout.labels:
@@ -263,7 +263,7 @@ def _check_doses(path: Path, dose: Array) -> None:
     given = dose[dose > 0.0]
     if len(given) and given.max() > LARGEST_ML:
         raise RecordingError(
-            f"{path}: a dose of {given.max():g} mL: allowed up to {LARGEST_ML:g} mL; check unit (uL?) and pump_ml_s"
+            f"{path}: a dose of {given.max():g} mL: allowed up to {LARGEST_ML:g} mL; check the unit (uL?) and pump_ml_s"
         )
     if len(given) >= MIN_ROWS and (np.diff(given) >= 0.0).all() and given[-1] > 3.0 * given[0]:
         raise RecordingError(f"{path}: the doses never decrease, as if they were totals; name their column fed_ml")

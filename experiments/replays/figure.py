@@ -11,7 +11,7 @@ def replay_figure(found: Replayed, title: str) -> Figure:
     """Draw OD with its predicted band, growth rate, pump flow with alarms, and the doses of device and controller."""
     figure, axes = new_figure(10.0, 9.0, 4, sharex=True, height_ratios=(2.2, 1.0, 1.0, 1.2))
     hours = found.minutes / 60.0
-    axes[0].fill_between(hours, found.low, found.high, color=COLOURS[1], alpha=0.3, lw=0, label=f"95 %, {AHEAD} before")
+    axes[0].fill_between(hours, found.low, found.high, color=COLOURS[1], alpha=0.3, lw=0, label=f"{AHEAD} ahead, 95 %")
     axes[0].plot(hours, found.od, ".", ms=2.5, color=COLOURS[0], label="reading")
     axes[0].plot(hours[~found.believed], found.od[~found.believed], "x", ms=4, color=COLOURS[3], label="rejected")
     axes[0].axhline(found.setpoint, color="black", lw=0.8, ls="--", label=f"setpoint {found.setpoint:.3g}")

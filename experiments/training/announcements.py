@@ -27,7 +27,7 @@ def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, s
     where = f"continues at step {step} of" if step else "for"
     who = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} agents, seeds {seeds[0]} to {seeds[-1]}"
     log.info("learns %s: %s; %s, %s %d steps", names, task.description, who, where, config.agent.total_steps)
-    limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} at rest"
+    limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} steady error"
     log.info("target: a policy within %s at its worst setpoint (regret: cost above that of the exact optimum)", limits)
     log.info("writes to %s; watch the training with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 

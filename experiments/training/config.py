@@ -88,7 +88,7 @@ class TrainConfig:
     n_agents: int = setting(1, "number of agents, with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
     device: str = setting("cpu", "device on which networks are trained", choices=("cpu", "cuda"))
     threads: int | None = setting(
-        None, "groups of 16 agents trained in parallel; null: one per core. No effect on results", at_least=1
+        None, "groups of 16 agents that train in parallel; null: one per core. No effect on results", at_least=1
     )
     eval_every: int = setting(
         100, "steps between evaluations of the greedy policy on the selection grid", "steps", at_least=1

@@ -101,8 +101,8 @@ class Evaluation:
 
     J = mean over the grid of the sum over the steps of error^2 after each step (without the error at the start).
     regret_pct = 100 (J / J* - 1). The steady error of a setpoint is the median of |error| over its starts and the last
-    `steady_steps` steps. It ignores starts from which the optimum is not at rest by then, e.g. if a slow pump cannot
-    dilute 1.1 to 0.2 in time: the optimum's error exceeds `arrived` and that from the best start.
+    `steady_steps` steps. A start does not count if the optimum is not at rest by then: its largest error in these steps
+    exceeds `arrived` and that of the best start of this setpoint. E.g. a slow pump cannot dilute 1.1 to 0.2 in time.
     Args: task: task to score. start: observations at the start, (G, O).
     """
 

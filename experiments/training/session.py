@@ -145,7 +145,7 @@ class Session:
         return announcements.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
     def report(self) -> tuple[Evaluation, Score, Score]:
-        """Return the evaluation on the reported grid, the scores of the kept policies, and those of the last ones."""
+        """Return the evaluation on the reported grid, the scores of the kept policies, and of the last policies."""
         report = Evaluation(self.task, self.task.report_grid())
         kept, last = (
             report(agents.act_with(self.agents.network, weights), self.agents.n_agents)

@@ -133,7 +133,7 @@ def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixtu
         with pytest.raises(frame.UserError, match=said):
             calibrate_pair(config, tmp_path)
     assert "a.csv: ignored: 29.0 degC from minute" in caplog.text
-    assert "it takes 180" in caplog.text
+    assert "at least 180 are needed" in caplog.text
 
 
 @pytest.mark.slow

@@ -248,7 +248,7 @@ def test_what_was_counted_stands_before_the_note_which_is_cut_to_a_line(tmp_path
     with pytest.raises(ValueError, match=r"share = 0\.4: allowed null together with level_ml; mark each separately"):
         MarkConfig(str(folder), "M0", share=0.4, level_ml=20.0)
     for key, value in {"share": 0.4, "level_ml": 18.5, "bottle_ml": 500.0}.items():
-        with pytest.raises(ValueError, match=f"reactor = '': allowed the reactor of {key}"):
+        with pytest.raises(ValueError, match=f"reactor = '': allowed a reactor, because {key} is given"):
             MarkConfig(str(folder), **{key: value})
     with pytest.raises(ValueError, match="minute = 3.0"):  # a level is of now
         MarkConfig(str(folder), "M0", level_ml=18.5, minute=3.0)

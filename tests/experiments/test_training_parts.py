@@ -730,5 +730,5 @@ def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_re
     with pytest.raises(UserError, match="far enough"):
         train_run.train(replace(config, resume="latest"), tmp_path)
     assert train_run.Session.call_args.args[0].env == config.env  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"pair = bs\.yaml: allowed null for .*; .* add env=coculture"):
+    with pytest.raises(ValueError, match=r"pair = bs\.yaml: allowed null for .*; .*env=coculture"):
         TrainConfig(pair="bs.yaml", agent=SMALL)

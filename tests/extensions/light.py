@@ -25,7 +25,7 @@ class IntegralConfig:
     gain: float = setting(0.003, "fall of the temperature per missing count", "degC", within=(0, 1))
     integral: float = setting(1e-5, "further fall per missing count at each sample", "degC", within=(0, 1))
     memory: float = setting(5.0, "readings over which the light is averaged", "readings", at_least=1.0)
-    far: float = setting(100.0, "distance from the setpoint above which the run reports it", "counts", above=0.0)
+    far: float = setting(100.0, "deviation from the setpoint above which the run warns", "counts", above=0.0)
 
     def __post_init__(self) -> None:
         check(self, "signals.light")
