@@ -185,7 +185,8 @@ def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with EmulatorProcess(["--reactors", "M0", "--speed", "60", "--od", "0.5"]) as device:
         backend = "backend=chibio", f"backend.url={device.url}", "backend.speed=60", "backend.reactors=[M0]"
-        words = *backend, "controller=pi", "hydra.run.dir=run"
+        patient = "backend.transport.floor_s=10"  # a busy machine may answer late
+        words = *backend, patient, "controller=pi", "hydra.run.dir=run"
         with Program("experiments.deploy", *words, cwd=tmp_path, out=tmp_path / "out") as first:
             first.until((folder / "state.json").exists)
         for name, content in (

@@ -240,7 +240,7 @@ def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
 
 def test_on_a_noisy_line_every_request_is_carried_out_exactly_once(cable: tuple[Cable, EmulatorProcess]) -> None:
     line, _ = cable
-    link = SerialTransport(str(line.pc), 1.0, config(line.pc, connect_s=0.5, read_s=1.5, floor_s=0.1), attempts=8)
+    link = SerialTransport(str(line.pc), 1.0, config(line.pc, connect_s=10.0, read_s=3.0, floor_s=0.1), attempts=8)
     link.post("/SetOutputTarget/Pump3/M0/0.001")
     line.noise = 0.05
     for k in range(40):
