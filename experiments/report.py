@@ -42,7 +42,6 @@ def write(folder: Path) -> Path:
     A benchmark has its own kind of page. The page of any other run shows its summary and figures. A folder of runs
     (e.g. of `make run`) gets a section for each run. Raises: frame.UserError without a run.
     """
-    from experiments.comparison import page as comparison
     from experiments.record import aftermath
     from experiments.reporting import page
 
@@ -53,9 +52,11 @@ def write(folder: Path) -> Path:
     runs.sort(key=lambda run: not (run / "recordings").is_dir())  # the deployment comes first
     compared = runs == [folder] and isinstance(summaries[0], dict) and "beside_paper" in summaries[0]
     try:
-        return page.save(
-            comparison.of_benchmark(folder) if compared else page.of_runs(folder, runs, aftermath.write), folder
-        )
+        if compared:
+            from experiments.comparison.page import of_benchmark  # loads SciPy
+
+            return page.save(of_benchmark(folder), folder)
+        return page.save(page.of_runs(folder, runs, aftermath.write), folder)
     except (OSError, ValueError, RecursionError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
     except (LookupError, TypeError, AttributeError) as error:

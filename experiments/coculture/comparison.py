@@ -1,6 +1,6 @@
 """Comparison of composition controllers: closed loops, numbers, figures and page."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -25,8 +25,8 @@ from experiments.coculture.signal import TRUE, Share
 from experiments.comparison import page, run, statistics, studies, trials
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.figures import by_plant, estimate
-from experiments.comparison.page import Measure, Row, Section, law_of, scaled, tables
-from experiments.comparison.statistics import Spread
+from experiments.comparison.page import Measure, Section, of_column, tables
+from experiments.comparison.statistics import CI95, DIFFERENCE, LOWER_IN, N, Row, RowColumn, Spread, Summary
 from experiments.comparison.studies import Drawing
 from experiments.comparison.trials import Cell, Followed, Trial, closed, record
 from experiments.control.policies import load_policy
@@ -45,7 +45,17 @@ FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")  # controllers th
 COLUMNS = {"share": TRUE, "estimate": "ratio", "low": "ratio_low", "high": "ratio_high"}
 """Field of a `ShareTrial` -> column of a recording."""
 
-ERRORS = {"_mean": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
+ABS_ERROR = RowColumn[float]("ratio_abs_error_mean", "Mean |r - setpoint|", ranked=True)
+LAST_2H = RowColumn[float]("ratio_abs_error_last2h", f"{ABS_ERROR.title} in the last 2 h of each window", ranked=True)
+LAST_DAY = RowColumn[float]("ratio_abs_error_last_day", f"{ABS_ERROR.title} on the last day", ranked=True)
+ABS_ERROR_SD, RMS, COVERS = map(RowColumn[float], ("ratio_abs_error_sd", "estimate_rms", "band_covers"))
+OD_MIN, OD_MEAN, OD_MAX = map(RowColumn[float], ("od_min", "od_mean", "od_max"))
+COMBINED: tuple[tuple[str, str, Callable[[Row], str]], ...] = (
+    ("estimate", "Error of the estimate (rms), and coverage of its 95 % band",
+     lambda row: f"{number(row[RMS])}, {100.0 * row[COVERS]:.0f} %"),
+    ("od", "OD: smallest, mean, largest", lambda row: f"{row[OD_MIN]:.3f}, {row[OD_MEAN]:.3f}, {row[OD_MAX]:.3f}"),
+)  # fmt: skip
+"""Tables with several columns in a cell: key, title, cell."""
 SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # in a figure, if there are more than these
 STEP = 5  # minutes between two points of a curve
 LAST_MIN, DAY_MIN = 120, 1440  # minutes at the end of a window or run over which an error is averaged
@@ -189,23 +199,24 @@ def last_hours(trial: ShareTrial) -> Array:
     return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
 
 
-def share_row(trial: ShareTrial) -> dict[str, Any]:
+def share_row(trial: ShareTrial) -> Row:
     """Build the row of a trial in summary.json; errors refer to the true share."""
     error, days = Spread(abs_error(trial)), trial.minute[-1] >= 2 * DAY_MIN
     inside = (trial.low <= trial.share) & (trial.share <= trial.high)
-    return trial.names() | {
-        "n": error.n,
-        "ratio_abs_error_mean": error.mean,
-        "ratio_abs_error_sd": error.sd,
-        "ci95": error.ci95,
-        "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
-        "ratio_abs_error_last_day": Spread(abs_error(trial, -DAY_MIN)).mean if days else float("nan"),
-        "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
-        "band_covers": float(inside.mean()),
-        "od_min": float(trial.od.min()),
-        "od_max": float(trial.od.max()),
-        "od_mean": float(trial.od.mean()),
+    columns = {
+        N: error.n,
+        ABS_ERROR: error.mean,
+        ABS_ERROR_SD: error.sd,
+        CI95: error.ci95,
+        LAST_2H: Spread(last_hours(trial)).mean,
+        LAST_DAY: Spread(abs_error(trial, -DAY_MIN)).mean if days else float("nan"),
+        RMS: float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
+        COVERS: float(inside.mean()),
+        OD_MIN: float(trial.od.min()),
+        OD_MAX: float(trial.od.max()),
+        OD_MEAN: float(trial.od.mean()),
     }
+    return Row.of(trial.names(), columns)
 
 
 def shares(trials: Sequence[ShareTrial]) -> Figure:
@@ -219,26 +230,26 @@ def shares(trials: Sequence[ShareTrial]) -> Figure:
             ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
             ax.plot(hours, middle, color=colour, linewidth=1.2)
         top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
-        top.set_title(law_of({"controller": trial.cell.controller, "preview": trial.foresight}))
+        top.set_title(Row.of(trial.names()).law)
         bottom.set_xlabel("hours")
     axes[0].set(ylabel="share of the second species", ylim=(0.0, 1.0))
     axes[columns].set_ylabel("vial, °C")
     return figure
 
 
-def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
+def share_errors(entries: Sequence[Row]) -> Figure:
     """Draw the error of every controller on every plant of a scenario: mean and 95 % interval."""
-    labels = list(dict.fromkeys(law_of(e) for e in entries))
+    labels = list(dict.fromkeys(e.law for e in entries))
     marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
     handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
     figure, (ax,), height = by_plant(entries, handles, 9.0, 1)
     for e in entries:
-        estimate(ax, marks[law_of(e)], height(e), e["ratio_abs_error_mean"], e["ci95"])
+        estimate(ax, marks[e.law], height(e), e[ABS_ERROR], e[CI95])
     ax.set(xlabel="mean |r - setpoint|", xlim=(0.0, None))
     return figure
 
 
-def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iterator[Drawing]:
+def _drawn(trials: Sequence[ShareTrial], rows: Sequence[Row]) -> Iterator[Drawing]:
     """Draw two figures per scenario: errors of all controllers on all plants, and the shares on the first plant."""
     for scenario in dict.fromkeys(t.cell.scenario for t in trials):
         here = [t for t in trials if t.cell.scenario == scenario]
@@ -248,7 +259,7 @@ def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iter
             first = [t for t in first if t.cell.controller in SHOWN]
         yield Drawing(
             f"composition_{scenario}_laws",
-            share_errors([r for r in rows if (r["signal"], r["scenario"]) == ("share", scenario)]),
+            share_errors([r for r in rows if (r.signal, r.scenario) == ("share", scenario)]),
             f"{scenario}: every controller and plant",
             "Mean and 95 % interval over the reactors.",
         )
@@ -261,32 +272,21 @@ def _drawn(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iter
 
 
 def _lower(pair: Row) -> str:
-    low, high = pair["ci95"]
-    between = "" if low is None or low != low else f" [{low:+.4f}, {high:+.4f}]"
-    return f"{pair['difference']:+.4f}{between}, lower in {pair['lower_in']} of {pair['n']}"
+    low, high = pair[CI95]
+    between = "" if low != low else f" [{low:+.4f}, {high:+.4f}]"
+    return f"{pair[DIFFERENCE]:+.4f}{between}, lower in {pair[LOWER_IN]} of {pair[N]}"
 
 
-def _estimate(row: Row) -> str:
-    return f"{number(row['estimate_rms'])}, {100.0 * row['band_covers']:.0f} %"
-
-
-def _od(row: Row) -> str:
-    return f"{row['od_min']:.3f}, {row['od_mean']:.3f}, {row['od_max']:.3f}"
-
-
-def _section(out: Page, summary: Row, run: Path) -> None:
+def _section(out: Page, summary: Summary, run: Path) -> None:
     rows, note = summary["rows"], "n = {n} reactors each."
-    for scenario in dict.fromkeys(str(r["scenario"]) for r in rows):
+    for scenario in dict.fromkeys(r.scenario for r in rows):
         out.section(scenario)
         add = partial(tables, out, scenario, laws_down=True)
-        for ending, when in ERRORS.items():
-            key = f"ratio_abs_error{ending}"
-            measure = Measure(key, f"Mean |r - setpoint|{when}", partial(scaled, key=key), note, key)
-            add([r for r in rows if r[key] is not None], measure)
+        for column in (ABS_ERROR, LAST_2H, LAST_DAY):
+            add([r for r in rows if np.isfinite(r[column])], of_column(column, note))
         add(summary["paired"], Measure("paired", "Difference to the vendor's PI", _lower, note))
-        title = "Error of the estimate (rms), and coverage of its 95 % band"
-        add(rows, Measure("estimate", title, _estimate, note, folded=True))
-        add(rows, Measure("od", "OD: smallest, mean, largest", _od, note, folded=True))
+        for key, title, text in COMBINED:
+            add(rows, Measure(key, title, text, note, folded=True))
         for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
             out.figure(run / f["file"], f["title"], f["caption"])
 
@@ -304,7 +304,7 @@ statistics.ROWS[SHARE] = lambda trial: [share_row(trial)]
 statistics.SCORES[SHARE] = lambda trial: [("all", "ratio_abs_error", abs_error(trial))]
 studies.AGAINST[SHARE] = ("pi",)
 studies.DRAWN[SHARE] = _drawn
-page.RANKED[SHARE] = ("ratio_abs_error_mean", "mean |r - setpoint|")
+page.RANKED[SHARE] = (ABS_ERROR, "mean |r - setpoint|")
 page.SECTIONS[SHARE] = Section("Composition of two species: comparison", _section, DEFINITIONS)
 run.COMPLETED.append(with_pair)
 run.FOLLOWED[SHARE] = policies_of

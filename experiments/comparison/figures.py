@@ -1,8 +1,7 @@
 """Figures of a benchmark, drawn from its trials and from the rows of its summary."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from experiments.comparison.config import TABLE_2
-from experiments.comparison.page import law_of
+from experiments.comparison.statistics import CI95, DIFFERENCE, ISE, METRIC, METRICS, PERCENT, VERDICT, WINDOW, Row
 from experiments.comparison.trials import DensityTrial
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
 from experiments.reporting.tables import clock
@@ -43,8 +42,9 @@ def _mark(controller: str) -> tuple[str, str]:
     return MARKS.get(controller, (COLOURS[0], "X"))
 
 
-def _handles(controllers: Sequence[str]) -> list[Line2D]:
-    return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
+def _handles(controllers: Iterable[str]) -> list[Line2D]:
+    marks = {c: _mark(c) for c in controllers}
+    return [Line2D([], [], color=colour, marker=m, linestyle="", label=c) for c, (colour, m) in marks.items()]
 
 
 def estimate(
@@ -115,22 +115,22 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
     return figure
 
 
-def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def published_and_ours(rows: Sequence[Row]) -> Figure:
     """Draw the values of the paper's Table 2 (hollow) and of this run (filled; bar: 95 % interval of the mean)."""
     cells = list(dict.fromkeys((p.scenario, p.window) for p in TABLE_2))
     names = [f"{w} °C" if s == "temperature_switch" else f"OD {w}" for s, w in cells]
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
     controllers = list(dict.fromkeys(p.controller for p in TABLE_2))
     for k, controller in enumerate(controllers):
-        for metric, ax in (("ise", left), ("itae", right)):
+        for metric, ax in zip(METRICS, (left, right), strict=True):
             for p in (p for p in TABLE_2 if p.controller == controller):
                 y = cells.index((p.scenario, p.window)) + 0.24 * (k - 1)
-                estimate(ax, _mark(controller), y, getattr(p, metric), (np.nan, np.nan), hollow=True)
+                estimate(ax, _mark(controller), y, getattr(p, metric.key), (np.nan, np.nan), hollow=True)
                 for r in rows:
-                    if (r["controller"], r["scenario"], r["window"]) == (controller, p.scenario, p.window):
-                        low, high = r[f"{metric}_ci95"]
-                        estimate(ax, _mark(controller), y, r[f"{metric}_mean"], (max(low, LEAST), high))
-    low_ise = min([p.ise for p in TABLE_2] + [r["ise_mean"] for r in rows])
+                    if (r.controller, r.scenario, r[WINDOW]) == (controller, p.scenario, p.window):
+                        low, high = r[metric.ci95]
+                        estimate(ax, _mark(controller), y, r[metric.mean], (max(low, LEAST), high))
+    low_ise = min([p.ise for p in TABLE_2] + [r[ISE.mean] for r in rows])
     left.set(xscale="log", xlabel="ISE (T = 1 min), OD² min", xlim=(0.6 * low_ise, None))
     left.set_yticks(range(len(cells)), names)
     left.invert_yaxis()
@@ -145,14 +145,14 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def by_plant(
-    entries: Sequence[Mapping[str, Any]], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
-) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
+    entries: Sequence[Row], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
+) -> tuple[Figure, list[Axes], Callable[[Row], float]]:
     """Create empty panels with one row per plant; return figure, axes, and a function (entry) -> vertical position.
 
     Args: entries: of all plants and controllers to draw. handles: of the legend. panels: number of panels.
     """
-    names = list(dict.fromkeys(str(e["plant"]) for e in entries))
-    controllers = list(dict.fromkeys(law_of(e) for e in entries))
+    names = list(dict.fromkeys(e.plant for e in entries))
+    controllers = list(dict.fromkeys(e.law for e in entries))
     figure, axes = new_figure(width, 1.6 + 0.62 * len(names), 1, panels, sharey=True)
     for ax in axes:
         for row in range(0, len(names), 2):
@@ -162,15 +162,11 @@ def by_plant(
     axes[0].set_yticks(range(len(names)), names)
     figure.legend(handles=list(handles), loc="outside upper center", ncols=5)
 
-    def height(entry: Mapping[str, Any]) -> float:
-        offset = (controllers.index(law_of(entry)) + 0.5) / len(controllers) - 0.5
-        return names.index(entry["plant"]) + 0.72 * offset
+    def height(entry: Row) -> float:
+        offset = (controllers.index(entry.law) + 0.5) / len(controllers) - 0.5
+        return names.index(entry.plant) + 0.72 * offset
 
     return figure, axes, height
-
-
-def _controllers(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(str(e["controller"]) for e in entries))
 
 
 def _log_axis(ax: Axes) -> None:
@@ -182,51 +178,51 @@ def _log_axis(ax: Axes) -> None:
     ax.xaxis.set_minor_formatter(NullFormatter())
 
 
-def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
+def plants(entries: Sequence[Row]) -> Figure:
     """Draw ISE and ITAE, summed over the windows, one row per plant: mean and 95 % interval. `hold` is left out.
 
     Args: entries: from `statistics.totals`, all of one scenario.
     """
-    entries = [e for e in entries if e["controller"] != "hold"]
+    entries = [e for e in entries if e.controller != "hold"]
     # One floor per plant is drawn: all controllers have the same sensors, so their floors nearly agree.
-    witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
+    witness = next((e for e in entries if e.controller == "oracle"), entries[0]).controller
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
-    figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), floor_line])
-    for metric, unit, ax in zip(("ise", "itae"), ("ISE, OD² min", "ITAE, OD min²"), axes, strict=True):
-        seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
+    figure, axes, height = by_plant(entries, [*_handles(e.controller for e in entries), floor_line])
+    for metric, ax in zip(METRICS, axes, strict=True):
+        seen = np.array([e[column] for e in entries for column in (metric.floor, metric.mean)])
         ax.set_xlim(0.6 * seen[seen > NOISELESS].min(), 1.8 * seen.max())
         for e in entries:
-            low, high = e[f"{metric}_ci95"]
-            estimate(ax, _mark(e["controller"]), height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
-            floor = e[f"floor_{metric}"]
-            if e["controller"] == witness and floor > NOISELESS:
+            low, high = e[metric.ci95]
+            estimate(ax, _mark(e.controller), height(e), e[metric.mean], (max(low, LEAST), high))
+            floor = e[metric.floor]
+            if e.controller == witness and floor > NOISELESS:
                 row = round(height(e))
                 ax.plot([floor, floor], [row - 0.42, row + 0.42], color="#b00020", linewidth=1.4, zorder=1)
         _log_axis(ax)
-        ax.set_xlabel(f"{unit}, sum over the windows (T = 1 min)")
+        ax.set_xlabel(f"{metric.name}, {metric.unit}, sum over the windows (T = 1 min)")
     return figure
 
 
-def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
+def differences(entries: Sequence[Row], against: str) -> Figure:
     """Draw paired differences of ISE and ITAE to the controller `against`, in % of its mean, with 95 % intervals.
 
     Args: entries: from `statistics.pairs` with `total_scores`, all of one scenario.
     """
-    entries = [e for e in entries if e["controller"] != "hold"]
+    entries = [e for e in entries if e.controller != "hold"]
     open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval includes 0")
-    figure, axes, height = by_plant(entries, [*_handles(_controllers(entries)), open_mark])
-    for metric, ax in zip(("ise", "itae"), axes, strict=True):
+    figure, axes, height = by_plant(entries, [*_handles(e.controller for e in entries), open_mark])
+    for metric, ax in zip(METRICS, axes, strict=True):
         ax.axvline(0.0, color="black", linewidth=1.0)
         ax.set_xscale("symlog", linthresh=20.0)
-        for e in (e for e in entries if e["metric"] == metric and np.isfinite(e["percent"])):
-            scale = e["percent"] / e["difference"] if e["difference"] else 0.0
-            hollow = e["verdict"] == "no difference shown"
-            estimate(ax, _mark(e["controller"]), height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
+        for e in (e for e in entries if e[METRIC] == metric.key and np.isfinite(e[PERCENT])):
+            scale = e[PERCENT] / e[DIFFERENCE] if e[DIFFERENCE] else 0.0
+            hollow = e[VERDICT] == "no difference shown"
+            estimate(ax, _mark(e.controller), height(e), e[PERCENT], [scale * v for v in e[CI95]], hollow)
         wide = ax.get_xlim()[1] > 200.0
         few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
         ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)
-        ax.set_xlabel(f"{metric.upper()} minus that of {against}, %")
+        ax.set_xlabel(f"{metric.name} minus that of {against}, %")
     return figure

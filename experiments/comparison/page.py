@@ -1,20 +1,19 @@
 """The page of a benchmark: the paper's Table 2 beside this run's, all plants, and where the learned policy loses."""
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
+from math import inf, isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from conf import guests
+from experiments.comparison import statistics as of
 from experiments.comparison.config import TABLE_2
+from experiments.comparison.statistics import Row, RowColumn, ScoreColumns, Summary
 from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus
 
-Row = Mapping[str, Any]
-METRICS = ("ise", "itae")
 PUBLISHED = ("dqn", "pi", "mpc")
-UNITS = {"ise": "OD² min", "itae": "OD min²"}
 
 DENSITY = {
     "error e": "measured OD minus setpoint, once a minute. A sample at the end of a window belongs to this and to the "
@@ -39,14 +38,9 @@ DENSITY = {
     "of comparisons.",
     "±": "one standard deviation over replicates.",
 }
-RANKED = {"density": ("itae_mean", "ITAE, OD min²")}
-"""Signal -> key and label of the measure that ranks controllers in the page's summary; a guest adds its own signal."""
+RANKED = {"density": (of.ITAE.mean, "ITAE, OD min²")}
+"""Signal -> column and label of the measure that ranks controllers in the summary; a guest adds its own signal."""
 OUT_OF_COMPETITION = ("oracle", "optimum")
-
-
-def law_of(entry: Row) -> str:
-    """Return the displayed name of an entry's controller."""
-    return f"{entry['controller']}, with preview" if entry.get("preview") else str(entry["controller"])
 
 
 def name_of(scenario: str, window: str) -> str:
@@ -54,12 +48,12 @@ def name_of(scenario: str, window: str) -> str:
     return f"{window} °C" if scenario == "temperature_switch" else window if "h" in window else f"OD {window}"
 
 
-def _find(entries: Sequence[Row], **wanted: str) -> Row | None:
-    return next((e for e in entries if all(e[k] == v for k, v in wanted.items())), None)
-
-
-def _windows(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys((r["scenario"], r["window"]) for r in rows))
+def _at(rows: Iterable[Row]) -> dict[tuple[str, str], dict[str, Row]]:
+    """Group rows: scenario and window -> controller -> row."""
+    found: dict[tuple[str, str], dict[str, Row]] = {}
+    for row in rows:
+        found.setdefault((row.scenario, row[of.WINDOW]), {})[row.controller] = row
+    return found
 
 
 def _lowest(values: Mapping[str, float]) -> str:
@@ -70,203 +64,121 @@ def _mark(text: str, best: bool) -> str:
     return Emphasis(text) if best else text
 
 
-def beside(summary: Row) -> list[Row]:
+def beside(summary: Summary) -> list[Row]:
     keys = ("controller", "plant", "scenario", "window")
-    chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
-    return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
+    return [r for r in summary["rows"] if {k: r.values.get(k) for k in keys} in summary["beside_paper"]]
 
 
-def table_2(rows: Sequence[Row], metric: str) -> Table:
+def _published(cell: tuple[str, str], metric: ScoreColumns) -> dict[str, float]:
+    return {p.controller: getattr(p, metric.key) for p in TABLE_2 if (p.scenario, p.window) == cell}
+
+
+def table_2(rows: Sequence[Row], metric: ScoreColumns) -> Table:
     """Build a table of one metric: the paper's values, and beside them the values of this run.
 
     Controllers that are not in the paper have further columns. The lowest value of each side is marked, ignoring the
     oracle. The last two columns name the lowest of the paper's three controllers on each side.
     """
     body: list[tuple[str, ...]] = []
-    others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
-    for scenario, window in _windows(rows):
-        theirs = {
-            p.controller: float(getattr(p, metric)) for p in TABLE_2 if (p.scenario, p.window) == (scenario, window)
-        }
-        found = {c: _find(rows, controller=c, scenario=scenario, window=window) for c in (*PUBLISHED, *others)}
-        ours = {c: float(r[f"{metric}_mean"]) for c, r in found.items() if r is not None and _runs(r)}
-        low_theirs, low_ours = _lowest(theirs), _lowest({c: v for c, v in ours.items() if c in PUBLISHED})
-        cells = [name_of(scenario, window)]
+    here = (*PUBLISHED, *dict.fromkeys(r.controller for r in rows if r.controller not in PUBLISHED))
+    for cell, found in _at(rows).items():
+        theirs = _published(cell, metric)
+        ours = {c: r[metric.mean] for c, r in found.items() if _runs(r)}
+        low_theirs, low_ours = _lowest(theirs), _lowest({c: ours[c] for c in PUBLISHED if c in ours})
+        cells = [name_of(*cell)]
         cells += [_mark(number(theirs.get(c), 4), c == low_theirs) for c in PUBLISHED]
-        for c, r in found.items():
-            text = "–" if r is None else plus_minus(r[f"{metric}_mean"], r[f"{metric}_sd"])
-            cells.append(_mark(text, c == _lowest(ours)))
+        cells += [_mark(_mean_sd(found[c], metric) if c in found else "–", c == _lowest(ours)) for c in here]
         body.append((*cells, low_theirs, low_ours))
-    columns = ("window", *(f"{c}, published" for c in PUBLISHED), *(f"{c}, here" for c in (*PUBLISHED, *others)),
-               "lowest published", "lowest of the three here")  # fmt: skip
-    n = rows[0]["n"]
+    columns = ("window", *(f"{c}, published" for c in PUBLISHED), *(f"{c}, here" for c in here), "lowest published",
+               "lowest of the three here")  # fmt: skip
     return Table(
-        f"table2_{metric}",
-        f"Table 2, {metric.upper()} ({UNITS[metric]}, T = 1 min)",
+        f"table2_{metric.key}",
+        f"Table 2, {metric.name} ({metric.unit}, T = 1 min)",
         columns,
         tuple(body),
-        f"Published: real reactors, n = 3. Here: simulation, n = {n}, mean ± standard deviation over replicates; "
-        "plants " + ", ".join(dict.fromkeys(str(r["plant"]) for r in rows)) + ". Marked: lowest, without the oracle.",
+        f"Published: real reactors, n = 3. Here: simulation, n = {rows[0][of.N]}, mean ± standard deviation over "
+        f"replicates; plants {', '.join(dict.fromkeys(r.plant for r in rows))}. Marked: lowest, without the oracle.",
     )
 
 
-class Loss(NamedTuple):
-    """Cell of the table in which one of the paper's controllers scores lower than the learned policy."""
-
-    cell: str
-    certain: bool  # the 95 % interval of the paired difference excludes 0
-    sentence: str
-
-
-def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> list[Loss]:
-    """List the paper's controllers that score lower here than the learned policy, cell by cell, the lowest first."""
-    found = []
-    for scenario, window in _windows(rows):
-        for metric in METRICS:
-            at = {c: _find(rows, controller=c, scenario=scenario, window=window) for c in (learned, *PUBLISHED[1:])}
-            values = {c: float(r[f"{metric}_mean"]) for c, r in at.items() if r is not None}
-            mine = at[learned]
-            if mine is None:
-                continue
-            cell = f"{name_of(scenario, window)}, {metric.upper()}"
-            for other in sorted((c for c in values if values[c] < values[learned]), key=lambda c: values[c]):
-                sentence = f"{cell}: {learned} {number(values[learned])} loses to {other} {number(values[other])}"
-                pair = _find(paired, controller=other, against=learned, plant=mine["plant"], scenario=scenario,
-                             window=window, metric=metric)  # fmt: skip
-                certain = False
-                if pair is not None and pair["ci95"][0] is not None:
-                    low, high = pair["ci95"]
-                    certain = pair["verdict"] != "no difference shown"
-                    sentence += (
-                        f"; {other} minus {learned}: {number(pair['difference'])}, 95 % {number(low)} to {number(high)}"
-                        f"{'' if certain else ', which includes 0'}"
-                    )
-                found.append(Loss(cell, certain, f"{sentence}."))
-    return found
-
-
-def published_losses() -> list[str]:
-    """List the cells of the paper's table in which another controller beats the DQN."""
-    found = []
-    for metric in METRICS:
-        for scenario, window in dict.fromkeys((p.scenario, p.window) for p in TABLE_2):
-            best = min(
-                (p for p in TABLE_2 if (p.scenario, p.window) == (scenario, window)), key=lambda p: getattr(p, metric)
-            )
-            if best.controller != "dqn":
-                found.append(f"{name_of(scenario, window)} {metric.upper()} ({best.controller})")
-    return found
-
-
-def matrix(
-    name: str,
-    title: str,
-    entries: Sequence[Row],
-    text: Callable[[Row], str],
-    note: str,
-    ranked_by: str | None = None,
-    floor: Callable[[Row], str] | None = None,
-    laws_down: bool = False,
-) -> Table:
-    """Tabulate entries, one row per plant and one column per controller; mark each plant's lowest, except the oracle.
-
-    Args: text: function that formats an entry as a cell. ranked_by: key that decides the lowest. floor: function that
-      formats the score of the sensor's noise for a last column. laws_down: one row per controller, a column per plant.
-    """
-    laws = list(dict.fromkeys(map(law_of, entries)))
-    body = []
-    for plant in dict.fromkeys(str(e["plant"]) for e in entries):
-        at = {law_of(e): e for e in entries if e["plant"] == plant}
-        values = {c: r[ranked_by] for c, r in at.items() if ranked_by and c != "oracle" and r[ranked_by] is not None}
-        least = min(values.values()) * (1.0 + 1e-9) if len(values) > 1 else float("-inf")
-        cells = [plant]
-        cells += [_mark(text(at[c]), values.get(c, float("inf")) <= least) if c in at else "–" for c in laws]
-        if floor is not None:
-            cells.append(floor(at.get("oracle") or next(iter(at.values()))))
-        body.append(tuple(cells))
-    columns = ("plant", *laws, *(("sensor-noise floor",) if floor else ()))
-    if laws_down:
-        (_, *columns_), *rows = zip(columns, *body, strict=True)
-        return Table(name, title, ("controller", *columns_), tuple(rows), note)
-    return Table(name, title, columns, tuple(body), note)
-
-
-def _mean_sd(row: Row, metric: str, scale: float) -> str:
-    sd = row[f"{metric}_sd"]
-    return plus_minus(scale * row[f"{metric}_mean"], None if sd is None else scale * sd)
-
-
-def scaled(row: Row, key: str, scale: float = 1.0) -> str:
-    """Format a value of a row, multiplied by `scale`; a dash for an unknown value."""
-    return number(None if row[key] is None else scale * row[key])
-
-
-def _percent(pair: Row) -> str:
-    low, high = pair["ci95"]
-    if pair["percent"] is None:
-        return number(pair["difference"])
-    if low is None or not pair["difference"]:
-        return f"{pair['percent']:+.1f}"
-    scale = pair["percent"] / pair["difference"]
-    return f"{pair['percent']:+.1f} [{scale * low:+.1f}, {scale * high:+.1f}]"
-
-
 class Measure(NamedTuple):
-    """Table of all controllers on all plants of a scenario. Attributes as in `matrix`; `note` has a field {n}."""
+    """Table of all controllers on all plants of a scenario; the plants' lowest is marked, except the oracle.
+
+    text: function that formats a row as a cell. note: with fields {n} and {scenario}. ranked_by: column that decides
+    the lowest. floor: function that formats the score of the sensor's noise for a last column.
+    """
 
     key: str
     title: str
     text: Callable[[Row], str]
     note: str
-    ranked_by: str | None = None
+    ranked_by: RowColumn[float] | None = None
     floor: Callable[[Row], str] | None = None
     folded: bool = False
 
 
-SCORES = [
-    Measure(
-        metric,
-        f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
-        partial(_mean_sd, metric=metric, scale=scale),
+def matrix(name: str, measure: Measure, entries: Sequence[Row], note: str, laws_down: bool = False) -> Table:
+    """Tabulate a measure, one row per plant and one column per controller. Args: laws_down: the other way round."""
+    laws, by, floor = list(dict.fromkeys(e.law for e in entries)), measure.ranked_by, measure.floor
+    body = []
+    for plant in dict.fromkeys(e.plant for e in entries):
+        at = {e.law: e for e in entries if e.plant == plant}
+        values = {c: r[by] for c, r in at.items() if by and c != "oracle" and isfinite(r[by])}
+        least = min(values.values()) * (1.0 + 1e-9) if len(values) > 1 else -inf
+        cells = [plant, *(_mark(measure.text(at[c]), values.get(c, inf) <= least) if c in at else "–" for c in laws)]
+        body.append((*cells, floor(at.get("oracle") or next(iter(at.values())))) if floor else tuple(cells))
+    columns = ("controller" if laws_down else "plant", *laws, *(("sensor-noise floor",) if floor else ()))
+    columns, *rows = zip(columns, *body, strict=True) if laws_down else (columns, *body)
+    return Table(name, measure.title, columns, tuple(rows), note)
+
+
+def _mean_sd(row: Row, metric: ScoreColumns, scale: float = 1.0) -> str:
+    return plus_minus(scale * row[metric.mean], scale * row[metric.sd])
+
+
+def _percent(pair: Row) -> str:
+    percent, difference, (low, high) = pair[of.PERCENT], pair[of.DIFFERENCE], pair[of.CI95]
+    if not isfinite(percent):
+        return number(difference)
+    if not isfinite(low) or not difference:
+        return f"{percent:+.1f}"
+    return f"{percent:+.1f} [{percent / difference * low:+.1f}, {percent / difference * high:+.1f}]"
+
+
+def of_column(column: RowColumn[float], note: str, folded: bool = False) -> Measure:
+    """Return the measure of a column with a title."""
+    ranked = column if column.ranked else None
+    return Measure(column.key, column.title, lambda row: number(row[column]), note, ranked, folded=folded)
+
+
+def _of_score(metric: ScoreColumns, scale: float, unit: str) -> Measure:
+    return Measure(
+        metric.key,
+        f"{metric.name} of the measured OD ({unit}, T = 1 min), sum over the windows",
+        lambda row: _mean_sd(row, metric, scale),
         "Mean ± standard deviation, n = {n}. Marked: lowest, not counting the oracle.",
-        f"{metric}_mean",
-        partial(scaled, key=f"floor_{metric}", scale=scale),
+        metric.mean,
+        lambda row: number(scale * row[metric.floor]),
     )
-    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²"))
-]
+
+
+SCORES = _of_score(of.ISE, 1000.0, "10⁻³ OD² min"), _of_score(of.ITAE, 1.0, "OD min²")
 FURTHER = [
-    Measure(key, title, partial(scaled, key=key), "Mean, n = {n}.", key if ranked else None, folded=True)
-    for key, title, ranked in (
-        ("itae_median", "ITAE of the measured OD (OD min²), sum over the windows, median over vials", True),
-        ("clean_ise", "ISE of the noise-free OD (OD² min), sum over the windows", True),
-        ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
-        ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
-        ("effort_ul_s", "Control effort (µL/s per decision)", False),
-        ("media_ml", "Fresh medium used (mL per vial)", False),
-        ("held", "Samples after which the interlock allowed no dose, per vial", False),
-    )
+    of_column(column, "Mean, n = {n}.", folded=True)
+    for column in (of.ITAE.median, of.ISE.clean, of.ITAE.clean, of.CLEAN_STEADY, of.EFFORT, of.MEDIA, of.HELD)
 ]
-ESTIMATES = [
-    Measure(key, title, partial(scaled, key=key), "{scenario}; mean, n = {n}.")
-    for key, title in (
-        ("error_2sd_pct", "Decisions with the true error e within 2 sd of its estimate, %"),
-        ("share_2sd_pct", "Decisions with the true growth share s within 2 sd of its estimate, %"),
-        ("supervised_pct", "Decisions by the supervisor's controller, %"),
-        ("alarm_pct", "Decisions by the supervisor's controller because of innovations, %"),
-    )
-]
+ESTIMATES = [of_column(c, "{scenario}; mean, n = {n}.") for c in (of.ERROR, of.GROWTH, of.SUPERVISED, of.ALARM)]
 
 
 def tables(out: Page, scenario: str, entries: Sequence[Row], *measures: Measure, laws_down: bool = False) -> None:
     """Add one table per measure for a scenario, if there are entries of it."""
-    known = [e for e in entries if e["scenario"] == scenario]
+    known = [e for e in entries if e.scenario == scenario]
     for m in measures if known else ():
-        note = m.note.format(n=known[0]["n"], scenario=scenario)
-        table = matrix(f"{scenario}_{m.key}", m.title, known, m.text, note, m.ranked_by, m.floor, laws_down)
+        table = matrix(f"{scenario}_{m.key}", m, known, m.note.format(n=known[0][of.N], scenario=scenario), laws_down)
         out.table(table, folded=f"{m.title}: {scenario}" if m.folded else "")
 
 
-def every_plant(out: Page, summary: Row, scenario: str) -> None:
+def every_plant(out: Page, summary: Summary, scenario: str) -> None:
     """Add the tables of a scenario on all plants: scores, paired differences, further measures."""
     out.add("subheading", text=scenario)
     tables(out, scenario, summary["totals"], *SCORES)
@@ -275,64 +187,62 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ("dqn", "Paired difference to the learned policy"),
         ("dqn_adaptive", "Paired difference to the adaptive policy"),
     ):
-        for metric in METRICS:
-            chosen = [p for p in summary["paired_totals"] if p["against"] == against and p["metric"] == metric]
+        for metric in of.METRICS:
+            chosen = [p for p in summary["paired_totals"] if (p[of.AGAINST], p[of.METRIC]) == (against, metric.key)]
             note = f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {{n}}. If "
             note += f"{against}'s mean is 0, the cell has the difference itself."
-            title = f"{heading}, {metric.upper()}, %"
-            tables(out, scenario, chosen, Measure(f"{metric}_vs_{against}", title, _percent, note, folded=True))
+            title = f"{heading}, {metric.name}, %"
+            tables(out, scenario, chosen, Measure(f"{metric.key}_vs_{against}", title, _percent, note, folded=True))
     tables(out, scenario, summary["totals"], *FURTHER)
 
 
-def estimates(out: Page, summary: Row, scenario: str) -> None:
-    """Add tables of the estimates' coverage and the supervisor's decisions in a scenario, on all plants."""
-    tables(out, scenario, [e for e in summary["totals"] if ESTIMATES[0].key in e], *ESTIMATES)
-
-
-def all_rows(summary: Row) -> Table:
+def all_rows(summary: Summary) -> Table:
     """Build a table of all rows of summary.json with their details."""
-    body = []
-    for row, more in zip(summary["rows"], summary["details"], strict=True):
-        body.append(
-            (
-                f"{row['scenario']}, {row['plant']}, {row['controller']}, {name_of(row['scenario'], row['window'])}",
-                str(row["n"]),
-                plus_minus(row["ise_mean"], row["ise_sd"]),
-                _interval(row["ise_ci95"]),
-                plus_minus(row["itae_mean"], row["itae_sd"]),
-                _interval(row["itae_ci95"]),
-                number(more["ise_per_window"]),
-                number(more["itae_per_window"]),
-                number(row["settling_min"]),
-                f"{more['settled']}/{row['n']}",
-                number(row["steady_abs_error"]),
-                number(more["floor_itae"]),
-                number(row["media_ml"]),
-                number(more["effort_ul_s"]),
-            )
-        )
-    columns = ("scenario, plant, controller, window", "n", "ISE", "95 %", "ITAE", "95 %", "ISE, T = window",
-               "ITAE, T = window", "settling, min", "settled", "steady error", "floor ITAE", "medium, mL",
-               "effort, µL/s")  # fmt: skip
-    return Table("rows", "Every controller, plant, scenario and window", columns, tuple(body))
+    found = zip((r for r in summary["rows"] if r.signal == "density"), summary["details"], strict=True)
+    headings, texts = zip(*ALL, strict=True)
+    body = tuple(tuple(text(row, more) for text in texts) for row, more in found)
+    return Table("rows", "Every controller, plant, scenario and window", headings, body)
 
 
-def _interval(ci: Sequence[float | None]) -> str:
-    return "–" if ci[0] is None else f"{number(ci[0])} to {number(ci[1])}"
+def _place(row: Row, _: Row) -> str:
+    return f"{row.scenario}, {row.plant}, {row.controller}, {name_of(row.scenario, row[of.WINDOW])}"
 
 
-def _in_short(out: Page, summary: Row) -> None:
+def _interval(ci: Sequence[float]) -> str:
+    return f"{number(ci[0])} to {number(ci[1])}" if isfinite(ci[0]) else "–"
+
+
+ALL: tuple[tuple[str, Callable[[Row, Row], str]], ...] = (
+    ("scenario, plant, controller, window", _place),
+    ("n", lambda row, _: str(row[of.N])),
+    ("ISE", lambda row, _: _mean_sd(row, of.ISE)),
+    ("95 %", lambda row, _: _interval(row[of.ISE.ci95])),
+    ("ITAE", lambda row, _: _mean_sd(row, of.ITAE)),
+    ("95 %", lambda row, _: _interval(row[of.ITAE.ci95])),
+    ("ISE, T = window", lambda _, more: number(more[of.ISE.per_window])),
+    ("ITAE, T = window", lambda _, more: number(more[of.ITAE.per_window])),
+    ("settling, min", lambda row, _: number(row[of.SETTLING])),
+    ("settled", lambda row, more: f"{more[of.SETTLED]}/{row[of.N]}"),
+    ("steady error", lambda row, _: number(row[of.STEADY])),
+    ("floor ITAE", lambda _, more: number(more[of.ITAE.floor])),
+    ("medium, mL", lambda row, _: number(row[of.MEDIA])),
+    ("effort, µL/s", lambda _, more: number(more[of.EFFORT])),
+)
+"""Columns of the table of all rows."""
+
+
+def _in_short(out: Page, summary: Summary) -> None:
     """Add the summary: the learned policy beside the paper's, and the lowest controller of each scenario and plant."""
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] != "density")):
-        key, _ = RANKED[str(entry["signal"])]
-        if entry.get(key) is not None and _runs(entry):
-            laws = places.setdefault((entry["scenario"], entry["plant"]), {})
-            laws.setdefault(law_of(entry), []).append(float(entry[key]))
-    unit = dict.fromkeys(RANKED[s][1] for s in dict.fromkeys(str(r["signal"]) for r in summary["rows"]))
+    for entry in (*summary["totals"], *(r for r in summary["rows"] if r.signal != "density")):
+        cost = entry[RANKED[entry.signal][0]]
+        if isfinite(cost) and _runs(entry):
+            laws = places.setdefault((entry.scenario, entry.plant), {})
+            laws.setdefault(entry.law, []).append(cost)
+    unit = dict.fromkeys(RANKED[r.signal][1] for r in summary["rows"])
     items = [f"{scenario} on {plant}: {_first(laws)}" for (scenario, plant), laws in places.items() if len(laws) > 1]
     alone = [] if items or summary["beside_paper"] else [_alone(summary, e) for e in summary["totals"] if _runs(e)]
-    learned = summary["beside_paper"] and _find(beside(summary), controller="dqn")
+    learned = summary["beside_paper"] and any(r.controller == "dqn" for r in beside(summary))
     if items or alone or learned:
         out.section("Summary")
     if learned:
@@ -345,18 +255,19 @@ def _in_short(out: Page, summary: Row) -> None:
 
 
 def _runs(entry: Row) -> bool:
-    return entry["controller"] not in OUT_OF_COMPETITION
+    return entry.controller not in OUT_OF_COMPETITION
 
 
-def _alone(summary: Row, entry: Row) -> str:
+def _alone(summary: Summary, entry: Row) -> str:
     """Return the scores of a controller, of the oracle if it was run, and of the sensor's noise, as text."""
-    oracle = _find(summary["totals"], controller="oracle", plant=entry["plant"], scenario=entry["scenario"])
+    names = ("oracle", entry.plant, entry.scenario)
+    oracle = next((e for e in summary["totals"] if (e.controller, e.plant, e.scenario) == names), None)
     scores = []
-    for metric in METRICS:
-        least = f"oracle {number(oracle[f'{metric}_mean'])}, " if oracle else ""
-        own = plus_minus(entry[f"{metric}_mean"], entry[f"{metric}_sd"])
-        scores.append(f"{metric.upper()} {own} {UNITS[metric]} ({least}noise {number(entry[f'floor_{metric}'])})")
-    return f"{entry['controller']}, {entry['scenario']} on {entry['plant']}: {', '.join(scores)}"
+    for metric in of.METRICS:
+        least = f"oracle {number(oracle[metric.mean])}, " if oracle else ""
+        noise = f"({least}noise {number(entry[metric.floor])})"
+        scores.append(f"{metric.name} {_mean_sd(entry, metric)} {metric.unit} {noise}")
+    return f"{entry.controller}, {entry.scenario} on {entry.plant}: {', '.join(scores)}"
 
 
 def _first(laws: Mapping[str, Sequence[float]]) -> str:
@@ -366,24 +277,40 @@ def _first(laws: Mapping[str, Sequence[float]]) -> str:
     return f"{law} {number(value)}, then {other} {number(beyond)}"
 
 
-def _beside_paper(out: Page, summary: Row) -> None:
-    rows = beside(summary)
-    lost, cells = losses(rows, summary["paired"]), 2 * len(_windows(rows))
-    cells_lost = len({loss.cell for loss in lost})
-    certain = len({loss.cell for loss in lost if loss.certain})
+def _beside_paper(out: Page, summary: Summary) -> None:
+    """Add the cells in which one of the paper's controllers scores lower here than the learned policy."""
+    learned, rows, lost, certain, items = "dqn", _at(beside(summary)), set(), set(), []
+    met = {(p.controller, p[of.AGAINST], p.plant, p.scenario, p[of.WINDOW], p[of.METRIC]): p for p in summary["paired"]}
+    for ((scenario, window), at), metric in product(rows.items(), of.METRICS):
+        values = {c: at[c][metric.mean] for c in (learned, *PUBLISHED[1:]) if c in at}
+        cell = f"{name_of(scenario, window)}, {metric.name}"
+        for other in sorted((c for c in values if values[c] < values.get(learned, -inf)), key=lambda c: values[c]):
+            lost.add(cell)
+            items.append(f"{cell}: {learned} {number(values[learned])} loses to {other} {number(values[other])}")
+            pair = met.get((other, learned, at[learned].plant, scenario, window, metric.key))
+            if pair is not None and isfinite(pair[of.CI95][0]):
+                items[-1] += (
+                    f"; {other} minus {learned}: {number(pair[of.DIFFERENCE])}, 95 % {_interval(pair[of.CI95])}"
+                )
+                if pair[of.VERDICT] == "no difference shown":
+                    items[-1] += ", which includes 0"
+                else:
+                    certain.add(cell)
+            items[-1] += "."
+    claim = f"Here the learned policy (dqn) is lowest in all {2 * len(rows)} cells."
     if lost:
         claim = (
-            f"Here the learned policy (dqn) loses {cells_lost} of {cells} cells, {certain} of them significantly "
-            "(95 % interval of the paired difference without 0):"
+            f"Here the learned policy (dqn) loses {len(lost)} of {2 * len(rows)} cells, {len(certain)} of them "
+            "significantly (95 % interval of the paired difference without 0):"
         )
-    else:
-        claim = f"Here the learned policy (dqn) is lowest in all {cells} cells."
-    theirs = published_losses()
+    published = product(of.METRICS, dict.fromkeys((p.scenario, p.window) for p in TABLE_2))
+    best = {(metric, cell): _lowest(_published(cell, metric)) for metric, cell in published}
+    theirs = [f"{name_of(*cell)} {metric.name} ({c})" for (metric, cell), c in best.items() if c != "dqn"]
     remark = f"In the paper's table the DQN loses {len(theirs)} of 10 cells: {', '.join(theirs)}."
-    out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
+    out.add("verdict", claim=claim, items=items, remark=remark)
 
 
-def _learning_section(out: Page, summary: Row, run: Path) -> None:
+def _learning_section(out: Page, summary: Summary, run: Path) -> None:
     first = [f for f in summary["figures"] if f["file"].startswith(("training/", "figures/fig2a"))]
     if not first and not summary["agents"]:
         return
@@ -404,28 +331,27 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
             out.figure(run / f["file"], f["title"], f["caption"])
 
 
-def _density(out: Page, summary: Row, run: Path) -> None:
+def _density(out: Page, summary: Summary, run: Path) -> None:
     """Add the sections of the density: the paper's Table 2, the figures, all plants, the estimates."""
     if summary["beside_paper"]:
         out.section("The paper's Table 2 beside this run")
-        for metric in METRICS:
+        for metric in of.METRICS:
             out.table(table_2(beside(summary), metric))
-    regulated = _find(summary["rows"], controller="dqn", scenario="regulation")
+    regulated = [r for r in summary["rows"] if (r.controller, r.scenario) == ("dqn", "regulation")]
     rest = [f for f in summary["figures"] if not f["file"].startswith(("training/", "figures/fig2a"))]
     if rest:
         out.section("Figures")
-        if regulated is not None:
+        for row in regulated[:1]:
             out.text(
-                f"Settling time from 0.7 to 0.5: {number(regulated['settling_min'])} min (median of {regulated['n']} "
+                f"Settling time from 0.7 to 0.5: {number(row[of.SETTLING])} min (median of {row[of.N]} "
                 f"replicates; paper: {summary['paper_settling_min']:g} min on average, start and band not stated)."
             )
         for f in rest:
             out.figure(run / f["file"], f["title"], f["caption"])
-    wide = [
-        s
-        for s in dict.fromkeys(e["scenario"] for e in summary["totals"])
-        if len({e["controller"] for e in summary["totals"] if e["scenario"] == s}) > 4
-    ]
+    laws: dict[str, set[str]] = {}
+    for e in summary["totals"]:
+        laws.setdefault(e.scenario, set()).add(e.controller)
+    wide = [scenario for scenario, names in laws.items() if len(names) > 4]
     if wide:
         out.section("Every plant")
         out.text(
@@ -434,30 +360,28 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
-    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0].key in e)
+    estimated = [e for e in summary["totals"] if of.ERROR.key in e.values]
     if estimated:
         out.section("Coverage of the estimates, and decisions of the supervisor")
-        for scenario in estimated:
-            estimates(out, summary, scenario)
+    for scenario in dict.fromkeys(e.scenario for e in estimated):
+        tables(out, scenario, estimated, *ESTIMATES)
 
 
 class Section(NamedTuple):
     """Part of the page for a signal. title: of the page. add: adds the sections. definitions: term -> its meaning."""
 
     title: str
-    add: Callable[[Page, Row, Path], None]
+    add: Callable[[Page, Summary, Path], None]
     definitions: Mapping[str, str]
 
 
-SECTIONS = {
-    "density": Section("Turbidostat control: benchmark", _density, DENSITY),
-}
+SECTIONS = {"density": Section("Turbidostat control: benchmark", _density, DENSITY)}
 
 
 def of_benchmark(run: Path) -> Page:
     guests.load("experiments.comparison")
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]
+    summary = of.read((run / "summary.json").read_text(encoding="utf-8"))
+    parts = [SECTIONS[s] for s in dict.fromkeys(r.signal for r in summary["rows"])] or [SECTIONS["density"]]
     out = Page(
         parts[0].title,
         f"{count(summary['loops'], 'closed loop')} of {count(summary['replicates'], 'simulated replicate')}"

@@ -16,7 +16,7 @@ from experiments.certification import certificate
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_plant_file
 from experiments.comparison import page as pages
-from experiments.comparison import studies
+from experiments.comparison import statistics, studies
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, Followed, Loops, cells
 from experiments.control.policies import find_policy, load_policy
@@ -149,12 +149,13 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
             loops.start([cell for cell in density if cell.controller == name], found[name])
         done = loops.results()
     trials = [done[cell] for cell in wanted]
-    summary = studies.summarise(config, trials) | {"calibration": fitted, "agents": agents}
+    summary = studies.summarise(config, trials)
     for drawing in studies.draw(config, trials, summary):
         keep(drawing)
     if density:
         _store([t for t in trials if isinstance(t, DensityTrial)], folder)
-    files.write_json(folder / "summary.json", summary | {"figures": shown})
+    more = {"calibration": fitted, "agents": agents, "figures": shown}
+    files.write_json(folder / "summary.json", statistics.content(summary) | more)
     report = page.save(pages.of_benchmark(folder), folder)
     loops_of = f"{count(len(trials), 'closed loop')} of {count(config.replicates, 'replicate')}"
     log.info("%s; report %s", loops_of, report)

@@ -11,6 +11,7 @@ from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
 from experiments.comparison import figures, statistics
 from experiments.comparison.config import SETTLING_MIN, TABLE_2, BenchmarkConfig
+from experiments.comparison.statistics import Row, Summary
 from experiments.comparison.trials import DensityTrial, Trial
 from experiments.reporting.calibration_charts import fit_figure
 
@@ -22,7 +23,7 @@ CAPTIONS = {
 }
 AGAINST: dict[str, tuple[str, ...]] = {"density": ("dqn", "dqn_adaptive", "oracle")}
 """Signal -> reference controllers of the paired comparisons; a guest adds its own signal."""
-DRAWN: dict[str, Callable[[Sequence[Any], Sequence[dict[str, Any]]], Iterator["Drawing"]]] = {}
+DRAWN: dict[str, Callable[[Sequence[Any], Sequence[Row]], Iterator["Drawing"]]] = {}
 """Signal of a guest -> function that draws figures from its trials and from their rows of summary.json."""
 
 
@@ -61,7 +62,7 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
     )
 
 
-def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
+def draw(config: BenchmarkConfig, trials: list[Trial], summary: Summary) -> Iterator[Drawing]:
     """Draw the figures of the studies. Args: summary: as `summarise` returns it."""
     for signal, drawn in DRAWN.items():
         yield from drawn([t for t in trials if t.cell.signal == signal], summary["rows"])
@@ -75,8 +76,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             "of the mean. Left is better.",
         )
     for scenario in dict.fromkeys(s for study in config.studies.values() for s in study.scenarios):
-        totals = [e for e in summary["totals"] if e["scenario"] == scenario]
-        if len({e["controller"] for e in totals}) < 5:
+        totals = [e for e in summary["totals"] if e.scenario == scenario]
+        if len({e.controller for e in totals}) < 5:
             continue
         yield Drawing(
             f"plants_{scenario}",
@@ -86,8 +87,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             f"{config.replicates}. Red: score of the sensor's noise alone, for a culture exactly on the setpoint. "
             "The controller `hold` is not drawn, because its values are far larger.",
         )
-        learned = "dqn_adaptive" if any(e["controller"] == "dqn_adaptive" for e in totals) else "dqn"
-        against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == learned]
+        learned = "dqn_adaptive" if any(e.controller == "dqn_adaptive" for e in totals) else "dqn"
+        against = [e for e in summary["paired_totals"] if e.scenario == scenario and e[statistics.AGAINST] == learned]
         if against:
             yield Drawing(
                 f"differences_{scenario}",
@@ -122,21 +123,14 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
                 )
 
 
-def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[dict[str, Any]]:
+def _table_2_rows(rows: list[Row], config: BenchmarkConfig) -> list[Row]:
     """List the rows that correspond to the paper's Table 2: its two studies, each on its first plant."""
-    shown = []
-    for name in ("setpoint_steps", "temperature_switch"):
-        if name in config.studies and config.studies[name].plants:
-            study = config.studies[name]
-            shown += [
-                r
-                for r in rows
-                if r["scenario"] == name and r["plant"] == study.plants[0] and r["controller"] in study.controllers
-            ]
-    return shown
+    paper = {name: config.studies[name] for name in ("setpoint_steps", "temperature_switch") if name in config.studies}
+    cells = {(name, study.plants[0], c) for name, study in paper.items() for c in study.controllers if study.plants}
+    return sorted((r for r in rows if (r.scenario, r.plant, r.controller) in cells), key=lambda r: r.scenario)
 
 
-def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
+def summarise(config: BenchmarkConfig, trials: list[Trial]) -> Summary:
     """Build summary.json from the trials: the numbers of all closed loops, and those of the paper."""
     plants, controllers = list(config.plants), list(config.controllers)
     density = [t for t in trials if isinstance(t, DensityTrial)]
@@ -149,7 +143,7 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
         "paper": [p._asdict() for p in TABLE_2],
         "paper_settling_min": SETTLING_MIN,
         "beside_paper": [
-            {k: r[k] for k in ("controller", "plant", "scenario", "window")} for r in _table_2_rows(rows, config)
+            {k: r.values[k] for k in ("controller", "plant", "scenario", "window")} for r in _table_2_rows(rows, config)
         ],
         "details": statistics.details(density),
         "totals": statistics.totals(ordered),

@@ -131,7 +131,7 @@ def test_samples_without_a_dose_are_counted_for_each_vial():
     np.testing.assert_array_equal(t.held, none)
     assert (t.held >= (t.od == 0.0).sum(axis=1)).all()
     assert len(set(t.held)) > 3
-    assert comparison.totals([t])[0]["held"] == pytest.approx(none.mean())
+    assert comparison.totals([t])[0].values["held"] == pytest.approx(none.mean())
 
 
 def test_windows_are_named_by_what_tells_them_apart():
@@ -399,4 +399,4 @@ def test_a_vial_that_overflowed_is_told_by_its_own() -> None:
     schedule = Scenario((0.5,), (3.0,), (37.0,))
     t = run_trial(Cell("hold", "nominal", "s"), c.plants["nominal"], schedule, make, c.env, 3, 0)
     assert t.overflowed.tolist() == [False, True, False]
-    assert comparison.details([t])[0]["overflowed"] == 1
+    assert comparison.details([t])[0].values["overflowed"] == 1

@@ -11,8 +11,9 @@ import pytest
 from matplotlib.colors import to_hex
 
 from experiments.coculture import comparison
-from experiments.comparison import figures, page, studies
+from experiments.comparison import figures, page, statistics, studies
 from experiments.comparison.config import SETTLING_MIN, TABLE_2, BenchmarkConfig, StudyConfig
+from experiments.comparison.statistics import Row, Summary
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
 from experiments.reporting import charts
 from experiments.reporting.page import Page
@@ -52,8 +53,8 @@ def test_each_number_stands_beside_its_own_plant_and_law_whatever_order_a_study_
         _, plant, law, _ = line[0].split(", ")
         assert float(line[-1]) == pytest.approx(of[plant, law]), "effort, uL/s"
     for entry in summary["totals"]:
-        assert entry["effort_ul_s"] == pytest.approx(of[entry["plant"], entry["controller"]])
-    assert [(e["plant"], e["controller"]) for e in summary["totals"]] == [
+        assert entry[statistics.EFFORT] == pytest.approx(of[entry.plant, entry.controller])
+    assert [(e.plant, e.controller) for e in summary["totals"]] == [
         (plant, law) for plant in config.plants for law in config.controllers if (plant, law) in of
     ]
     assert {b["plant"] for b in summary["beside_paper"]} == {"upset_pump"}
@@ -70,13 +71,13 @@ def _dot(line: Any) -> bool:
     return line.get_marker() not in ("", "None", None) and len(line.get_xdata()) == 1
 
 
-def entry(plant: str, law: str, floor: float) -> dict[str, Any]:
+def entry(plant: str, law: str, floor: float, **more: Any) -> Row:
     """As `statistics.totals` has it, of an ISE of 0.05 and an ITAE of 20."""
-    found: dict[str, Any] = {"scenario": "day", "plant": plant, "controller": law, "n": 4}
+    found: dict[str, Any] = {"signal": "density", "scenario": "day", "plant": plant, "controller": law, "n": 4}
     for metric, mean, noise in (("ise", 0.05, floor), ("itae", 20.0, 1000.0 * floor)):
         found |= {f"{metric}_mean": mean, f"{metric}_sd": 0.1 * mean, f"{metric}_ci95": [0.9 * mean, 1.1 * mean]}
         found |= {f"floor_{metric}": noise, f"clean_{metric}": mean, f"{metric}_median": mean}
-    return found | {"clean_steady_abs_error": 0.01, "effort_ul_s": 1.0, "media_ml": 1.0, "held": 0.0}
+    return Row.of(found | {"clean_steady_abs_error": 0.01, "effort_ul_s": 1.0, "media_ml": 1.0, "held": 0.0} | more)
 
 
 def section() -> Page:
@@ -124,8 +125,8 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
     rows, paired = [], []
     for window in ise:
         for k, law in enumerate(("dqn", "pi", "mpc")):
-            at = {"controller": law, "plant": "bench", "scenario": "setpoint_steps", "window": window, "n": 4}
-            row: dict[str, Any] = dict(at)
+            at = {"signal": "density", "controller": law, "plant": "bench", "scenario": "setpoint_steps"}
+            row: dict[str, Any] = at | {"window": window, "n": 4}
             for metric, values in (("ise", ise), ("itae", itae)):
                 mean = values[window][k]
                 row |= {f"{metric}_mean": mean, f"{metric}_sd": 0.001, f"{metric}_ci95": [mean, mean]}
@@ -135,12 +136,13 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
                     "ci95": [-0.02, -0.01 if known else 1.0],
                 }
                 if law != "dqn":
-                    paired.append({**at, "against": "dqn", "metric": metric, "difference": beyond[window], **said})
-            rows.append(row)
+                    more = {"against": "dqn", "metric": metric, "window": window, "difference": beyond[window]}
+                    paired.append(Row.of(at | more | said))
+            rows.append(Row.of(row))
     keys = ("controller", "plant", "scenario", "window")
-    summary = {"rows": rows, "paired": paired, "beside_paper": [{k: r[k] for k in keys} for r in rows]}
+    places = [{k: r.values[k] for k in keys} for r in rows]
     out = section()
-    page._beside_paper(out, summary)
+    page._beside_paper(out, {"rows": rows, "paired": paired, "beside_paper": places})
     (said,) = [content for _, blocks in out.sections for kind, content in blocks if kind == "verdict"]
     assert [word for word in said["claim"].replace(",", "").split() if word.isdigit()][:3] == ["3", "6", "2"]
     assert len(said["items"]) == 4
@@ -156,12 +158,13 @@ def texts(out: Page) -> list[str]:
 
 def test_every_number_of_a_row_stands_under_its_own_heading() -> None:
     """No two numbers of the row are alike, and three of four vials settled."""
-    row = {"scenario": "day", "plant": "bench", "controller": "pi", "window": "6-12 h", "n": 4, "ise_mean": 0.1}
+    names = {"signal": "density", "scenario": "day", "plant": "bench", "controller": "pi"}
+    row = names | {"window": "6-12 h", "n": 4, "ise_mean": 0.1}
     row |= {"ise_sd": 0.02, "ise_ci95": [0.06, 0.16], "itae_mean": 7.0, "itae_sd": 0.5, "itae_ci95": [6.0, 8.5]}
     row |= {"settling_min": 12.0, "steady_abs_error": 0.013, "media_ml": 41.0, "ise_median": 0.3, "itae_median": 9.0}
     more = {"ise_per_window": 0.0033, "itae_per_window": 0.23, "settled": 3, "floor_itae": 1.7, "effort_ul_s": 2.6}
     more |= {"clean_ise": 0.08, "clean_itae": 5.5, "floor_ise": 0.9, "clean_abs_error": 0.011, "overflowed": 1}
-    table = page.all_rows({"rows": [row], "details": [more]})
+    table = page.all_rows({"rows": [Row.of(row)], "details": [Row.of(names | more)]})
     assert list(zip(table.columns, table.rows[0], strict=True)) == [
         ("scenario, plant, controller, window", "day, bench, pi, 6-12 h"), ("n", "4"), ("ISE", "0.1 ± 0.02"),
         ("95 %", "0.06 to 0.16"), ("ITAE", "7 ± 0.5"), ("95 %", "6 to 8.5"), ("ISE, T = window", "0.0033"),
@@ -179,16 +182,9 @@ def test_differences_to_each_law_stand_in_a_table_of_their_own_by_metric() -> No
             for i, plant in enumerate(("nominal", "bench")):
                 percent = 10.0 * k + 3.0 * j + i + 1.0
                 low, high = percent / 200.0, percent / 50.0
-                at = {
-                    "scenario": "day",
-                    "plant": plant,
-                    "controller": "pi",
-                    "against": against,
-                    "metric": metric,
-                    "n": 4,
-                }
-                pairs.append({**at, "percent": percent, "difference": percent / 100.0, "ci95": [low, high]})
-    pairs[-1] |= {"percent": None, "difference": 0.75}
+                value = {"percent": percent, "difference": percent / 100.0, "ci95": [low, high]}
+                pairs.append(entry(plant, "pi", 0.004, against=against, metric=metric, **value))
+    pairs[-1] = Row.of({**pairs[-1].values, "percent": None, "difference": 0.75})
     out = section()
     page.every_plant(out, {"totals": totals, "paired_totals": pairs}, "day")
     tables = {table.name: table for table in out.tables}
@@ -203,18 +199,19 @@ def test_differences_to_each_law_stand_in_a_table_of_their_own_by_metric() -> No
         assert f"in % of {k}'s mean" in table.note
 
 
-def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law() -> None:
+def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law(tmp_path: Path) -> None:
     """A law that estimates nothing is not among them, nor what happened in another scenario."""
     parts = {"error_2sd_pct": 91.0, "share_2sd_pct": 83.0, "supervised_pct": 12.0, "alarm_pct": 4.0}
     totals = [
-        entry("bench", "dqn_adaptive", 0.004) | parts,
+        entry("bench", "dqn_adaptive", 0.004, **parts),
         entry("bench", "pi", 0.004),
-        entry("nominal", "dqn_adaptive", 0.004) | {key: value / 2.0 for key, value in parts.items()},
-        entry("bench", "dqn_adaptive", 0.004) | {**dict.fromkeys(parts, 1.0), "scenario": "night"},
+        entry("nominal", "dqn_adaptive", 0.004, **{key: value / 2.0 for key, value in parts.items()}),
+        entry("bench", "dqn_adaptive", 0.004, **dict.fromkeys(parts, 1.0), scenario="night"),
     ]
     out = section()
-    page.estimates(out, {"totals": totals}, "day")
-    said = {table.title: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
+    page._density(out, {"totals": totals, "rows": [], "beside_paper": [], "figures": []}, tmp_path)
+    day = [table for table in out.tables if table.name.startswith("day_")]
+    said = {table.title: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in day}
     columns = ("plant", "dqn_adaptive")
     assert said == {
         "Decisions with the true error e within 2 sd of its estimate, %":
@@ -227,20 +224,21 @@ def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law() 
     }  # fmt: skip
 
 
-def share_entry(scenario: str, plant: str, law: str, k: float) -> dict[str, Any]:
+def share_entry(scenario: str, plant: str, law: str, k: float) -> Row:
     errors = {"ratio_abs_error_mean": 0.01 * k, "ratio_abs_error_last2h": 0.02 * k, "ratio_abs_error_last_day": None}
     rest = {"estimate_rms": 0.03 * k, "band_covers": 0.09 * k, "od_min": 0.1 * k, "od_mean": 0.2 * k, "od_max": 0.4 * k}
-    return {"signal": "share", "scenario": scenario, "plant": plant, "controller": law, "n": 3, **errors, **rest}
+    names = {"signal": "share", "scenario": scenario, "plant": plant, "controller": law, "n": 3}
+    return Row.of(names | errors | rest)
 
 
 def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate_covers_and_the_density(tmp_path):
     """Laws down, plants across; one law did not run on the second plant; no reading is of a last day."""
     rows = [share_entry("steps", "one", "pi", 1.0), share_entry("steps", "one", "midpoint", 2.0)]
     rows += [share_entry("steps", "two", "midpoint", 3.0), share_entry("sine", "one", "pi", 4.0)]
-    at = {"plant": "one", "controller": "midpoint", "n": 3}
+    at = {"signal": "share", "plant": "one", "controller": "midpoint", "n": 3}
     paired = [
-        {**at, "scenario": "steps", "difference": 0.01, "ci95": [-0.002, 0.03], "lower_in": 1},
-        {**at, "scenario": "sine", "difference": -0.02, "ci95": [None, None], "lower_in": 3},
+        Row.of({**at, "scenario": "steps", "difference": 0.01, "ci95": [-0.002, 0.03], "lower_in": 1}),
+        Row.of({**at, "scenario": "sine", "difference": -0.02, "ci95": [None, None], "lower_in": 3}),
     ]
     out = section()
     page.SECTIONS["share"].add(out, {"rows": rows, "paired": paired, "figures": []}, tmp_path)
@@ -258,15 +256,15 @@ def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate
     assert [heading for heading, _ in out.sections[1:]] == ["steps", "sine"]
 
 
-def paper_row(law: str, scenario: str, window: str, value: float, plant: str = "nominal") -> dict[str, Any]:
+def paper_row(law: str, scenario: str, window: str, value: float, plant: str = "nominal") -> Row:
     numbers = {"ise_mean": value, "ise_sd": 0.0, "itae_mean": value, "itae_sd": 0.0, "settling_min": 100.0 * value}
-    return {"signal": "density", "controller": law, "plant": plant, "scenario": scenario, "window": window, "n": 5,
-            **numbers}  # fmt: skip
+    names = {"signal": "density", "controller": law, "plant": plant, "scenario": scenario, "window": window, "n": 5}
+    return Row.of(names | numbers)
 
 
 def test_the_lowest_of_all_controllers_but_the_oracle_is_marked() -> None:
     rows = [paper_row(law, "setpoint_steps", "0.8", k) for k, law in enumerate(("oracle", "mine", "pi", "mpc"), 1)]
-    [row] = page.table_2(rows, "ise").rows
+    [row] = page.table_2(rows, statistics.ISE).rows
     assert [str(cell)[0] for cell in row[4:] if isinstance(cell, page.Emphasis)] == ["2"]
 
 
@@ -293,7 +291,7 @@ def test_the_settling_time_beside_the_paper_s_is_that_of_the_policy_in_the_regul
     rows.append(paper_row("dqn", "regulation", "0.5", 0.125))
     charts.save(charts.new_figure(2.0, 2.0)[0], tmp_path / "figures", "regulation")
     figure = {"file": "figures/regulation.svg", "title": "", "caption": ""}
-    summary = {"rows": rows, "beside_paper": [], "figures": [figure], "totals": [], "paper_settling_min": 10.0}
+    summary: Summary = {"rows": rows, "beside_paper": [], "figures": [figure], "totals": [], "paper_settling_min": 10.0}
     out = Page("", "")
     page._density(out, summary, tmp_path)
     assert texts(out) == [
@@ -327,7 +325,7 @@ def test_every_scenario_has_figures_of_its_own_numbers_against_the_adaptive_poli
     config, trials = compared("mine", ("setpoint_steps", "again"), laws, ("bench",))
     summary = studies.summarise(config, trials)
     assert (summary["seed"], summary["replicates"], summary["loops"]) == (7, 2, 10)
-    assert {p["against"] for p in summary["paired"]} == {"dqn", "dqn_adaptive"}
+    assert {p[statistics.AGAINST] for p in summary["paired"]} == {"dqn", "dqn_adaptive"}
     drawn = {d.name: d for d in studies.draw(config, trials, summary)}
     assert {name: d.title for name, d in drawn.items()} == {
         "plants_setpoint_steps": "Every plant, setpoint_steps", "plants_again": "Every plant, again",
@@ -336,12 +334,13 @@ def test_every_scenario_has_figures_of_its_own_numbers_against_the_adaptive_poli
     }  # fmt: skip
     for scenario in ("setpoint_steps", "again"):
         for metric, axes in zip(("ise", "itae"), drawn[f"plants_{scenario}"].figure.axes, strict=True):
-            own = [e for e in summary["totals"] if (e["scenario"], e["controller"]) == (scenario, "pi")]
-            assert marks_of(axes, "pi") == pytest.approx([e[f"{metric}_mean"] for e in own])
+            own = [e for e in summary["totals"] if (e.scenario, e.controller) == (scenario, "pi")]
+            assert marks_of(axes, "pi") == pytest.approx([e.values[f"{metric}_mean"] for e in own])
         for metric, axes in zip(("ise", "itae"), drawn[f"differences_{scenario}"].figure.axes, strict=True):
             assert axes.get_xlabel() == f"{metric.upper()} minus that of dqn_adaptive, %"
             wanted = {"scenario": scenario, "controller": "mpc", "against": "dqn_adaptive", "metric": metric}
-            of = {p["plant"]: p["percent"] for p in summary["paired_totals"] if wanted.items() <= p.items()}
+            pairs = [p for p in summary["paired_totals"] if wanted.items() <= p.values.items()]
+            of = {p.plant: p[statistics.PERCENT] for p in pairs}
             names = [text.get_text() for text in drawn[f"differences_{scenario}"].figure.axes[0].get_yticklabels()]
             assert marks_of(axes, "mpc") == pytest.approx([of[plant] for plant in names])
 
@@ -371,8 +370,8 @@ def test_a_figure_stands_in_the_scenario_that_its_title_begins_with(tmp_path: Pa
         charts.save(charts.new_figure(2.0, 2.0)[0], tmp_path / "figures", name)
         shown.append({"file": f"figures/{name}.svg", "title": f"{name}: drawn", "caption": f"of {name}"})
     rest = {"beside_paper": [], "totals": [], "paired": [], "paired_totals": [], "agents": {}, "calibration": None}
-    numbers = {"loops": 12, "replicates": 3, "seed": 9, "details": [], "figures": shown, "rows": rows}
-    (tmp_path / "summary.json").write_text(json.dumps(numbers | rest))
+    numbers: Any = {"loops": 12, "replicates": 3, "seed": 9, "details": [], "figures": shown, "rows": rows, **rest}
+    (tmp_path / "summary.json").write_text(json.dumps(statistics.content(numbers)))
     out = page.of_benchmark(tmp_path)
     assert re.findall(r"\d+", out.subtitle) == ["12", "3", "9"]
     sections = dict(out.sections)
@@ -399,14 +398,14 @@ ITAE = {
 }
 
 
-def ours(factor: float) -> list[dict[str, object]]:
+def ours(factor: float, **more: object) -> list[Row]:
     """Rows of a run whose every value is the paper's times `factor`."""
     return [
-        {
-            "controller": c, "plant": "nominal_noise", "scenario": scenario, "window": window, "n": 3,
-            "ise_mean": factor * ISE[scenario, window][k], "ise_sd": 0.0, "ise_ci95": [np.nan, np.nan],
+        Row.of({
+            "signal": "density", "controller": c, "plant": "nominal_noise", "scenario": scenario, "window": window,
+            "ise_mean": factor * ISE[scenario, window][k], "ise_sd": 0.0, "ise_ci95": [np.nan, np.nan], "n": 3,
             "itae_mean": factor * ITAE[scenario, window][k], "itae_sd": 0.0, "itae_ci95": [np.nan, np.nan],
-        }
+        } | more)
         for scenario, window in ISE
         for k, c in enumerate(CONTROLLERS)
     ]  # fmt: skip
@@ -422,9 +421,9 @@ def test_every_published_value_is_the_papers():
 
 def test_published_stands_left_and_ours_right_and_the_lowest_of_the_three_is_marked_on_either_side():
     """Here an oracle, which the paper does not have, is lower; in the first window the paper's own mpc, here pi."""
-    rows = ours(2.0) + [row | {"controller": "oracle", "ise_mean": 0.001} for row in ours(2.0)[::3]]
-    rows[1]["ise_mean"] = 0.002
-    table = page.table_2(rows, "ise")
+    rows = ours(2.0) + ours(2.0, controller="oracle", ise_mean=0.001)[::3]
+    rows[1] = Row.of({**rows[1].values, "ise_mean": 0.002})
+    table = page.table_2(rows, statistics.ISE)
     assert table.columns == (
         "window", "dqn, published", "pi, published", "mpc, published", "dqn, here", "pi, here", "mpc, here",
         "oracle, here", "lowest published", "lowest of the three here",
@@ -434,7 +433,7 @@ def test_published_stands_left_and_ours_right_and_the_lowest_of_the_three_is_mar
     ]  # fmt: skip
     marked = [[k for k, cell in enumerate(row) if isinstance(cell, Emphasis)] for row in table.rows[:2]]
     assert (marked, table.rows[0][-2:]) == ([[3, 5], [1, 4]], ("mpc", "pi"))
-    itae = page.table_2(ours(2.0), "itae")
+    itae = page.table_2(ours(2.0), statistics.ITAE)
     assert [str(cell) for cell in itae.rows[3]] == [
         "37 °C", "12.42", "9.65", "11.6", "24.8", "19.3", "23.2", "pi", "pi",
     ]  # fmt: skip

@@ -93,9 +93,9 @@ def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
     share = np.where(minute >= 3000 - 1440, 0.51, 0.7)[None]
     t = made_up([[0.0]], setpoint=np.full(3000, 0.5))
     t = replace(t, schedule=phases(3000.0), minute=minute, share=share, estimate=share, low=share, high=share)
-    assert comparison.share_row(t)["ratio_abs_error_last_day"] == pytest.approx(0.01)
+    assert comparison.share_row(t)[comparison.LAST_DAY] == pytest.approx(0.01)
     short = {key: getattr(t, key)[..., :2800] for key in ("minute", "share", "setpoint", "estimate", "low", "high")}
-    assert math.isnan(comparison.share_row(replace(t, **short))["ratio_abs_error_last_day"])
+    assert math.isnan(comparison.share_row(replace(t, **short))[comparison.LAST_DAY])
 
 
 def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_sensor():
@@ -106,7 +106,8 @@ def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_se
         for law, off, announced in (("proportional", 0.1, False), ("pi", 0.1 * (k + 2), True)):
             one = made_up([[0.9, 0.5 + off, 0.5 + off, 0.4 + off], [0.9, 0.5 + off, 0.5 + off, 0.4 + off]], law=law)
             trials.append(replace(one, cell=ShareCell(law, "coculture", "s", "share", density, announced, calibrated)))
-    found = {(p["density"], p["calibrated"]): p["difference"] for p in statistics.pairs(trials, "pi")}
+    pairs = (pair.values for pair in statistics.pairs(trials, "pi"))
+    found = {(p["density"], p["calibrated"]): p["difference"] for p in pairs}
     assert found == pytest.approx({kind: -0.1 * (k + 1) for k, kind in enumerate(kinds)})
     elsewhere = [replace(t, cell=replace(t.cell, plant="other")) for t in trials if t.cell.controller == "pi"]
     assert statistics.pairs([t for t in trials if t.cell.controller != "pi"] + elsewhere, "pi") == []
@@ -205,7 +206,7 @@ def test_a_row_of_a_share_tells_root_mean_square_cover_and_densities_of_all_its_
     low, high = t.low.copy(), t.high.copy()
     low[0, 1], high[1, 2:] = 0.7, 0.3
     od = np.array([[0.4, 0.5, 0.6, 0.5], [0.5, 0.5, 0.5, 0.9]])
-    row = comparison.share_row(replace(t, estimate=t.share + off, low=low, high=high, od=od))
+    row = comparison.share_row(replace(t, estimate=t.share + off, low=low, high=high, od=od)).values
     assert row["n"] == 2
     assert row["estimate_rms"] == pytest.approx(math.sqrt((0.09 + 0.01) / 8.0))
     assert row["band_covers"] == pytest.approx(5.0 / 8.0)

@@ -36,6 +36,7 @@ from experiments.coculture import comparison
 from experiments.coculture.charts import composition_figure_of, pair_figure
 from experiments.coculture.comparison import ShareCell, ShareTrial
 from experiments.comparison import figures
+from experiments.comparison.statistics import Row
 from experiments.comparison.trials import Cell, DensityTrial
 from experiments.record.record import Recordings
 from experiments.record.summary import figure_of
@@ -207,22 +208,22 @@ def share_trial() -> ShareTrial:
     )
 
 
-def totals(law: str, ise: float, itae: float) -> dict[str, Any]:
-    found: dict[str, Any] = {"controller": law, "plant": "p", "floor_ise": 0.01, "floor_itae": 2.0}
+def totals(law: str, ise: float, itae: float, window: str = "0.8") -> Row:
+    found = entry(law) | {"window": window, "floor_ise": 0.01, "floor_itae": 2.0}
     for name, value in (("ise", ise), ("itae", itae)):
         found |= {f"{name}_mean": value, f"{name}_ci95": [0.9 * value, 1.3 * value]}
-    return found
+    return Row.of(found)
 
 
-def row(ise: float, itae: float) -> dict[str, Any]:
-    return totals("dqn", ise, itae) | {"scenario": "setpoint_steps", "window": "0.8"}
+def entry(law: str) -> dict[str, Any]:
+    return {"signal": "density", "controller": law, "plant": "p", "scenario": "setpoint_steps"}
 
 
-def difference(metric: str, percent: float) -> dict[str, Any]:
+def difference(metric: str, percent: float, law: str = "pi", verdict: str = "higher") -> Row:
     """Of which 1 is 50 %: an interval from 0.1 below to 0.3 above."""
     value = percent / 50.0
-    between = {"difference": value, "ci95": [value - 0.1, value + 0.3], "verdict": "higher"}
-    return {"controller": "pi", "plant": "p", "metric": metric, "percent": percent, **between}
+    between = {"difference": value, "ci95": [value - 0.1, value + 0.3], "verdict": verdict}
+    return Row.of(entry(law) | between | {"metric": metric, "percent": percent})
 
 
 @cache
@@ -413,7 +414,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (1, "line 0", "hours", "vial, °C", np.arange(0, 121, 5) / 60, np.full(25, 31.0)),
         (1, "band 0", "hours", "vial, °C", np.arange(0, 121, 5) / 60, [[30.1] * 25, [31.9] * 25]),
     ]),
-    "the paper's table": (lambda: figures.published_and_ours([row(0.05, 6.0)]), [
+    "the paper's table": (lambda: figures.published_and_ours([totals("dqn", 0.05, 6.0)]), [
         (0, "row 0.045 0.065", "ISE (T = 1 min), OD² min", "", 0.05, -0.24),
         (1, "row 5.4 7.8", "ITAE (T = 1 min), OD min²", "", 6.0, -0.24),
     ]),
@@ -428,7 +429,7 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (1, "row 20 40", "ITAE minus that of dqn, %", "", 25.0, 0.0),
     ]),
     "errors of a share": (lambda: comparison.share_errors(
-        [{"controller": "pi", "plant": "p", "ratio_abs_error_mean": 0.1, "ci95": [0.09, 0.13]}]), [
+        [Row.of(entry("pi") | {"ratio_abs_error_mean": 0.1, "ci95": [0.09, 0.13]})]), [
         (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
     ]),
     "curves of a sweep": (lambda: sweep_page.learning_curves(
@@ -608,8 +609,8 @@ def test_errors_of_a_share_have_the_mark_of_their_law_in_the_row_of_their_plant(
     """Two laws on two plants, one of the laws told ahead and not; a law that did not run leaves its place empty."""
     laws_of = (("pi", False), ("midpoint", False), ("midpoint", True))
     entries = [
-        {"controller": law, "preview": told, "plant": plant, "ratio_abs_error_mean": 0.01 * (3 * i + k + 1),
-         "ci95": [0.005 * (3 * i + k + 1), 0.03 * (3 * i + k + 1)]}
+        Row.of(entry(law) | {"preview": told, "plant": plant, "ratio_abs_error_mean": 0.01 * (3 * i + k + 1),
+                             "ci95": [0.005 * (3 * i + k + 1), 0.03 * (3 * i + k + 1)]})
         for i, plant in enumerate(("wide", "narrow"))
         for k, (law, told) in enumerate(laws_of)
         if (i, k) != (1, 1)
@@ -633,16 +634,15 @@ def test_every_law_keeps_its_mark_and_one_that_does_nothing_is_off_the_scale() -
     assert [name for name in marks if name != "sensor-noise floor"] == ["pi", "mpc"]
     assert dots(costs.axes[0]) == {(0.05, -0.18): marks["pi"], (0.2, 0.18): marks["mpc"]}
     assert dots(costs.axes[1]) == {(6.0, -0.18): marks["pi"], (9.0, 0.18): marks["mpc"]}
-    unsure = {"controller": "mpc", "verdict": "no difference shown"}
-    entries = [difference("ise", 30.0), difference("ise", -10.0) | unsure]
-    entries.append({**difference("ise", 9000.0), "controller": "hold"})
+    entries = [difference("ise", 30.0), difference("ise", -10.0, "mpc", "no difference shown")]
+    entries.append(difference("ise", 9000.0, "hold"))
     drawn = figures.differences(entries, "dqn_adaptive")
     assert dots(drawn.axes[0]) == {(30.0, -0.18): marks["pi"], (-10.0, 0.18): marks["mpc"]}
     alone = (line for line in drawn.axes[0].lines if len(line.get_xdata()) == 1)
     assert [line.get_xdata()[0] for line in alone if to_hex(line.get_markerfacecolor()) == "#ffffff"] == [-10.0]
     assert [label(ax, "x") for ax in drawn.axes] == [f"{m} minus that of dqn_adaptive, %" for m in ("ISE", "ITAE")]
     assert drawn.axes[0].get_xlim()[1] < 9000.0
-    paper = figures.published_and_ours([row(0.05, 6.0), {**row(0.06, 7.0), "controller": "mpc", "window": "0.5"}])
+    paper = figures.published_and_ours([totals("dqn", 0.05, 6.0), totals("mpc", 0.06, 7.0, "0.5")])
     assert legend(paper).items() >= {law: marks[law] for law in ("pi", "mpc")}.items()
     names = [text.get_text() for text in paper.axes[0].get_yticklabels()]
     assert names == ["OD 0.8", "OD 0.65", "OD 0.5", "37 °C", "30 °C"]

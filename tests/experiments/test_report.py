@@ -22,6 +22,7 @@ from experiments.benchmark import main
 from experiments.cli import files, frame
 from experiments.comparison import page as comparison
 from experiments.comparison.run import benchmark as run_benchmark
+from experiments.comparison.statistics import Row
 from experiments.reporting import charts
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Emphasis, Table, count, number, plus_minus, typeset
@@ -138,13 +139,13 @@ def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
     """Six laws, each of which is best by one measure alone; the oracle is better still, and out of competition."""
     measures = (*RANKED, "effort_ul_s", "media_ml", "held")
     entries = [
-        {"controller": law, "plant": "p", "scenario": "s", "n": 3, "ise_sd": 0.1, "itae_sd": 0.1, "floor_ise": 0.1,
-         "floor_itae": 0.1} | {key: 1.0 if LAWS.index(law) == i else 2.0 + i for i, key in enumerate(measures)}
-        for law in LAWS
+        {"signal": "density", "controller": law, "plant": "p", "scenario": "s", "n": 3, "ise_sd": 0.1, "itae_sd": 0.1,
+         "floor_ise": 0.1, "floor_itae": 0.1}
+        | {key: 1.0 if LAWS.index(law) == i else 2.0 + i for i, key in enumerate(measures)} for law in LAWS
     ]  # fmt: skip
     entries.append({**entries[0], "controller": "oracle", **dict.fromkeys(measures, 0.5)})
     page = one_section()
-    comparison.every_plant(page, {"totals": entries, "paired_totals": []}, "s")
+    comparison.every_plant(page, {"totals": [*map(Row.of, entries)], "paired_totals": []}, "s")
     further = {table.title: str(table.rows[0][1]) for table in page.tables if table.note == "Mean, n = 3."}
     assert further == {  # law a's, which is 2 and more by measure
         "ITAE of the measured OD (OD min²), sum over the windows, median over vials": "4",
@@ -164,14 +165,14 @@ def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tm
     measures = ("ratio_abs_error_mean", "ratio_abs_error_last2h", "ratio_abs_error_last_day")
     rest = dict.fromkeys(("estimate_rms", "band_covers", "od_min", "od_mean", "od_max"), 0.5)
     entries = [
-        {"controller": law, "plant": "p", "scenario": "s", "n": 3, **rest}
+        {"signal": "share", "controller": law, "plant": "p", "scenario": "s", "n": 3, **rest}
         | {key: 0.1 if LAWS.index(law) == i else 0.2 for i, key in enumerate(measures)}
         for law in LAWS[:3]
     ]
-    pair = {**entries[1], "difference": -0.1, "ci95": [-0.12, -0.05], "lower_in": 2}
+    pair = Row.of({**entries[1], "difference": -0.1, "ci95": [-0.12, -0.05], "lower_in": 2})
     page = one_section()
     guests.load("experiments.comparison")
-    comparison.SECTIONS["share"].add(page, {"rows": entries, "paired": [pair], "figures": []}, tmp_path)
+    comparison.SECTIONS["share"].add(page, {"rows": [*map(Row.of, entries)], "paired": [pair], "figures": []}, tmp_path)
     (differences,) = (table for table in page.tables if table.name == "s_paired")
     assert differences.rows == (("b", "-0.1000 [-0.1200, -0.0500], lower in 2 of 3"),)
     assert [marked(page, f"s_{key}") for key in measures] == [["a"], ["b"], ["c"]]
@@ -180,7 +181,7 @@ def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tm
 def test_in_short_the_lowest_of_each_plant_is_named_and_the_oracle_is_not():
     def entry(signal, law, value, **more):
         key = "itae_mean" if signal == "density" else "ratio_abs_error_mean"
-        return {"signal": signal, "controller": law, "plant": "p", "scenario": signal, key: value} | more
+        return Row.of({"signal": signal, "controller": law, "plant": "p", "scenario": signal, key: value} | more)
 
     totals = [entry("density", law, value) for law, value in (("dqn", 9.0), ("mpc", 8.5), ("oracle", 3.0))]
     rows = [entry("share", "midpoint", value, preview=True) for value in (0.05, 0.03)]
@@ -199,9 +200,9 @@ def test_in_short_a_law_without_rival_stands_beside_the_oracle_and_the_noise(ora
     """`+experiment=regulation` runs one law on one plant; it is held to the oracle, if any, and to the noise."""
     own = {"signal": "density", "controller": "dqn", "plant": "p", "scenario": "s", "ise_sd": 0.02, "itae_sd": 2.0}
     own |= {"ise_mean": 0.17, "itae_mean": 12.6, "floor_ise": 0.001, "floor_itae": 4.9}
-    best = own | {"controller": "oracle", "ise_mean": 0.16, "itae_mean": 9.0}
+    rows = [Row.of(own), Row.of(own | {"controller": "oracle", "ise_mean": 0.16, "itae_mean": 9.0})]
     page = one_section()
-    comparison._in_short(page, {"beside_paper": [], "totals": [own, best][: 1 + oracle], "rows": [own]})
+    comparison._in_short(page, {"beside_paper": [], "totals": rows[: 1 + oracle], "rows": rows[:1]})
     (said,) = re.findall("<li>dqn, s on p: (.*)</li>", page.html())
     ise, itae = (["0.17", "0.02", "0.16", "0.001"], ["12.6", "2", "9", "4.9"])
     assert re.findall(r"\d[\d.]*", said) == [n for n in ise + itae if oracle or n not in ("0.16", "9")]

@@ -14,8 +14,8 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.comparison import statistics
-from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_scores, totals
-from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, run_trial, windows
+from experiments.comparison.statistics import SETTLING, Row, Spread, details, pairs, rows, total_scores, totals
+from experiments.comparison.trials import Cell, DensityTrial, Trial, run_trial
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.signals import Density, within_2sd
 from hardware.emulator.device import plant_preset
@@ -58,8 +58,7 @@ def test_the_interval_is_students() -> None:
 
 def test_a_row_tells_means_over_replicates() -> None:
     one = trial()
-    [first, second] = rows([one])
-    assert str(first) == str(row(one, windows(one.schedule)[0]))  # nan among them
+    first, second = (row.values for row in rows([one]))
     assert first.items() >= {**NAMES, "window": "0.5", "setpoint": 0.5, "n": 2}.items()
     assert (second["window"], second["setpoint"]) == ("0.8", 0.8)
     # the last sample of a window is the first of the next: there the error is 0.3 more, over half a minute
@@ -89,12 +88,12 @@ def test_a_row_tells_means_over_replicates() -> None:
 def test_settling_is_the_median_and_never_is_late(errors: tuple[float, ...], settling: float) -> None:
     """By the measured OD: 0.845 is beyond 5 % of 0.8 and 0.765 within, whatever a sensor without noise had shown."""
     one = trial(error=errors)
-    assert row(one, Window("0.8", 0.8, 20.0, 50.0))["settling_min"] == pytest.approx(settling, nan_ok=True)
+    assert rows([one])[1][SETTLING] == pytest.approx(settling, nan_ok=True)
 
 
 def test_details_tell_the_rest() -> None:
     """The first replicate settled as it was measured, 0.035 below 0.8, and not as it was, 0.045 below."""
-    [first, second] = details([trial(error=(-0.035, -0.2))])
+    first, second = (row.values for row in details([trial(error=(-0.035, -0.2))]))
     means = {"ise": (0.035**2 + 0.2**2) / 2.0, "itae": 0.1175, "clean": (0.045**2 + 0.21**2) / 2.0}
     assert (first["window_min"], first["effort_ul_s"]) == (20.0, pytest.approx(2.0))
     assert second == {
@@ -110,7 +109,7 @@ def test_details_tell_the_rest() -> None:
 def test_totals_are_sums_over_windows() -> None:
     """Of e from 0 to 20 min, where the last half minute goes to e + 0.3, and of e for 30 min; pump moves by time."""
     one = trial()
-    [found] = totals([one])
+    [found] = (row.values for row in totals([one]))
 
     def ise(*errors: float) -> np.ndarray:
         return np.array([20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) + 30.0 * e**2 for e in errors])
@@ -133,13 +132,13 @@ def test_totals_are_sums_over_windows() -> None:
     # the last eleven samples of the first window have one of the next setpoint among them
     assert found["clean_steady_abs_error"] == pytest.approx(0.14 + 0.5 * 0.3 / 11.0)
     still = replace(one, rate=np.where(one.minute < 20.0, one.rate, 0.0))
-    assert totals([still])[0]["effort_ul_s"] == pytest.approx(20.0 * 2.0 / 50.0)
+    assert totals([still])[0].values["effort_ul_s"] == pytest.approx(20.0 * 2.0 / 50.0)
 
 
 def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     mine, theirs = trial("mpc", (0.1, 0.2, 0.15)), trial("pi", (0.2, 0.3, 0.26))
     strange = replace(theirs, cell=Cell("dqn", "noisy", "steps"))
-    found = pairs([mine, theirs, strange], "pi")
+    found = [pair.values for pair in pairs([mine, theirs, strange], "pi")]
     assert [(p["controller"], p["against"], p["window"], p["metric"]) for p in found] == [
         ("mpc", "pi", window, metric) for window in ("0.5", "0.8") for metric in ("ise", "itae")
     ]
@@ -148,42 +147,42 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert late["percent"] == pytest.approx(100.0 * (0.45 / 0.76 - 1.0))
     assert (late["n"], late["verdict"], late["plant"], late["scenario"]) == (3, "lower", "quiet", "steps")
     assert late["ci95"] == pytest.approx(Spread(450.0 * np.array([-0.1, -0.1, -0.11])).ci95)
-    whole = pairs([mine, theirs], "pi", total_scores)
+    whole = [pair.values for pair in pairs([mine, theirs], "pi", total_scores)]
     assert [(p["window"], p["metric"]) for p in whole] == [("all", "ise"), ("all", "itae")]
     assert whole[1]["difference"] == pytest.approx(650.0 * (0.15 - 0.76 / 3.0))
-    assert pairs([mine, theirs], "mpc", total_scores)[1]["verdict"] == "higher"
+    assert pairs([mine, theirs], "mpc", total_scores)[1].values["verdict"] == "higher"
     same = pairs([replace(theirs, cell=Cell("dqn", "quiet", "steps")), theirs], "pi")
-    assert {p["verdict"] for p in same} == {"no difference shown"}
+    assert {p.values["verdict"] for p in same} == {"no difference shown"}
     small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")
-    assert small[2]["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
+    assert small[2].values["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
     perfect = replace(theirs, od=np.where(theirs.minute < 20.0, 0.5, 0.8) * np.ones((3, 1)))
-    assert math.isnan(pairs([mine, perfect], "pi")[3]["percent"])
+    assert math.isnan(pairs([mine, perfect], "pi")[3].values["percent"])
 
 
 def test_a_third_signal_has_rows_and_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it adds is what a row holds and what laws are compared by; the rest is as for the others."""
-    monkeypatch.setitem(statistics.ROWS, "heat", lambda t: [{"signal": "heat", "warmest": t.temperature.max()}])
+    monkeypatch.setitem(statistics.ROWS, "heat", lambda t: [Row.of(t.names() | {"warmest": t.temperature.max()})])
     monkeypatch.setitem(statistics.SCORES, "heat", lambda t: [("all", "warmth", t.temperature.mean(axis=1))])
     density = trial("pi")
     mine, theirs = (
         Trial(Cell(name, "quiet", "steps", "heat"), density.schedule, density.minute, np.full((2, 3), warm))
         for name, warm in (("mine", 30.0), ("theirs", 31.0))
     )
-    assert [r["signal"] for r in rows([density, mine])] == ["density", "density", "heat"]
-    [found] = pairs([density, trial("mine"), mine, theirs], "theirs")
+    assert [r.signal for r in rows([density, mine])] == ["density", "density", "heat"]
+    [found] = (pair.values for pair in pairs([density, trial("mine"), mine, theirs], "theirs"))
     assert (found["signal"], found["metric"], found["difference"], found["lower_in"]) == ("heat", "warmth", -1.0, 2)
 
 
 def test_medians_of_costs_and_of_differences_are_those_of_the_replicates_and_not_their_means() -> None:
     """Seven vials, one of them far off; the interval of a median of seven is from the least to the largest."""
     off = (0.02, 0.01, 0.03, 0.04, 0.05, 0.06, 0.9)
-    _, second = rows([trial(error=off)])
+    _, second = (row.values for row in rows([trial(error=off)]))
     assert (second["ise_median"], second["itae_median"]) == pytest.approx((30.0 * 0.04**2, 450.0 * 0.04))
-    [whole] = totals([trial(error=off)])
+    [whole] = (row.values for row in totals([trial(error=off)]))
     each = [20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) + 30.0 * e**2 for e in off]
     assert (whole["ise_median"], whole["itae_median"]) == pytest.approx((sorted(each)[3], 650.0 * 0.04 + 3.0))
     assert (whole["n"], whole["held"]) == (7, 6.0)
-    late = pairs([trial("mpc", tuple(0.1 + e for e in off)), trial("pi", (0.1,) * 7)], "pi")[3]
+    late = pairs([trial("mpc", tuple(0.1 + e for e in off)), trial("pi", (0.1,) * 7)], "pi")[3].values
     assert (late["difference"], late["median"]) == pytest.approx((450.0 * sum(off) / 7.0, 450.0 * 0.04))
     assert late["median_ci95"] == pytest.approx([450.0 * 0.01, 450.0 * 0.9])
     assert late["lower_in"] == 0
@@ -320,7 +319,7 @@ def test_decisions_are_counted_from_where_the_schedule_begins(off: float, inside
 
 def test_totals_tell_the_mean_over_vials_in_per_cent() -> None:
     told = {"supervised": np.array([0.0, 0.0, 0.3]), "growth_share": np.array([1.0, 1.0, 0.7])}
-    [found] = totals([replace(trial(error=(0.1, 0.2, 0.6)), told=told)])
+    [found] = (row.values for row in totals([replace(trial(error=(0.1, 0.2, 0.6)), told=told)]))
     assert found["supervised_pct"] == pytest.approx(10.0)
     assert found["share_2sd_pct"] == pytest.approx(90.0)
     assert "error_2sd_pct" not in found

@@ -151,7 +151,7 @@ def costs(config: SupervisionConfig) -> Table:
             mine, theirs = (np.sum([t.score(w).itae for w in windows(schedule)], axis=0) for t in (watched, plain))
             more, mean = Spread(mine - theirs), float(np.mean(theirs))
             low, high = (100.0 * end / mean for end in more.ci95)
-            acted = totals([watched])[0]["supervised_pct"]
+            acted = totals([watched])[0].values["supervised_pct"]
             body.append(
                 (f"{plant}, {name}", f"{100.0 * more.mean / mean:+.2f} [{low:+.2f}, {high:+.2f}]", number(acted))
             )
