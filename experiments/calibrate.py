@@ -8,6 +8,8 @@ from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from envs.identification.calibration import calibrate
 from envs.identification.model import NotIdentifiable
 from envs.identification.screening import Series, merged
@@ -48,7 +50,9 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
         merging = f"{len(read.time)} rows merged into {len(raw.time)} rows, each of a minute or more"
         recording = replace(recording, notes=(*recording.notes, merging))
     hours = (raw.time[-1] - raw.time[0]) / 60
-    print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
+    fed_ml = 60.0 * float(raw.pump_rate[:-1] @ np.diff(raw.time))
+    where = f"{recording.source}: rows {read.row[0]}-{read.row[-1]}, {hours:.1f} h, {fed_ml:.4g} mL fed"
+    print(f"{where}; fitting", flush=True)
     try:
         result = calibrate(raw, config.identify, recording.doubts)
     except NotIdentifiable as error:
@@ -83,7 +87,8 @@ def _write_twin(path: Path, behind: Twin, source: str) -> str:
     try:
         text = twin_yaml(behind, source)
     except ValueError as error:
-        return f"no {path.name}: {str(error)[-200:]}"
+        why = str(error) if len(str(error)) < 200 else f"{str(error)[:80]} ... {str(error)[-80:]}"
+        return f"no {path.name}: {why}; leave out the rows where the culture changes: rows=FIRST:END"
     path.write_text(text, encoding="utf-8")
     return str(path)
 

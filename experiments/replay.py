@@ -47,7 +47,10 @@ class ReplayConfig(Source):
     controller: Any = part(LearnedConfig, "controller of the pump rate", registry.config_at)
     policy: str = setting("shipped", "for controller=dqn: `shipped`, a policy.npz, a run folder, or `latest`")
     setpoint: float | None = setting(
-        None, "setpoint of the controller; null: the median OD at which the device dosed", "OD", within=(0.02, 1.5)
+        None,
+        "setpoint of the controller; null: the median OD at which the device dosed, at most 1.5",
+        "OD",
+        within=(0.02, 1.5),
     )
     env_file: str | None = setting(None, "growth model of the controller: a calibrated.yaml, or `latest`")
     bench: Bench = part(Bench, "volume of the vial and largest feed rate; the period is that of the readings")

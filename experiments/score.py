@@ -31,7 +31,9 @@ log = logging.getLogger(__name__)
 class ScoreConfig:
     """Config of a score: policy and task. Raises: ValueError with key, value and allowed range."""
 
-    policy: str = setting("", "a policy.npz, a run folder, `latest`, or module:function of a file in this folder")
+    policy: str = setting(
+        "", "a policy.npz, a run folder, `latest`, `shipped` (with env=relative), or module:function of a file here"
+    )
     env: Any = part(EnvConfig, "the task", env_schema)
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: the newest one of calibrate; replaces env")
     onnx: str | None = setting(None, "FILE.onnx: also write the network of a policy.npz there")
@@ -76,7 +78,10 @@ def _found(name: str, task: tasks.Task) -> Any:
     if policy.observation != task.observation or policy.actions.size != task.actions.size:
         seen = f"{policy.actions.size} actions from {', '.join(policy.observation)}"
         asked = f"{task.actions.size} from {', '.join(task.observation)}"
-        raise frame.UserError(f"policy={name}: {seen}, but this task has {asked}; choose the env= of the policy")
+        raise frame.UserError(
+            f"policy={name}: {seen}, but this task has {asked}; choose the env= of the policy"
+            + (", env=relative" if policy.observation == policies.RELATIVE else "")
+        )
     return policy
 
 

@@ -28,7 +28,10 @@ SLOW_ROWS_MIN = 2.0  # warning: min between rows; a pump rate that changes betwe
 UNSTEADY = 0.15  # warning: sd of the hourly mean of the growth rate over mu
 UNSEEN = 0.5  # warning: fraction of a dose missing from the next reading
 CORRELATED = 0.2  # warning: correlation of the innovations from row to row
-AGAIN = "calibrate again shortly before the run, or use policy=shipped, which needs no calibration"
+AGAIN = (
+    "calibrate again shortly before the run, leave out the rows where the culture changes (rows=FIRST:END, "
+    "figures/drift.png), or use policy=shipped, which needs no calibration"
+)
 
 
 @dataclass(frozen=True)

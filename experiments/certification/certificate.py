@@ -246,6 +246,11 @@ def _other_model(policy: Policy, config: CertifyConfig, bench: Bench, model: Env
     if not abs(proven.mu / mu - 1.0) <= config.uncertainty:
         remedy = "train for this culture, or certify without env.mu"
         return f"it is proven for mu = {proven.mu:.3g}, but trained for {mu:.3g} +- {share:.0f} % ({remedy})"
+    if model.mu != EnvConfig().mu and not abs(model.mu / proven.mu - 1.0) <= config.uncertainty:
+        remedy = "train for this culture with this env_file, or use policy=shipped"
+        return (
+            f"it is proven for mu = {proven.mu:.3g} +- {share:.0f} %, this run's env_file has {model.mu:.3g} ({remedy})"
+        )
     tau = proven.tau * bench.tau / config.bench.tau
     if abs(model.tau / tau - 1.0) <= config.uncertainty:
         return ""

@@ -52,18 +52,21 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     claim = f"Training: {agents} trained on {model} for {steps} steps in {seconds:.0f} s."
     unit = ERROR_UNITS.get(kind, ERROR_UNITS["relative"])
     law = summary["myopic_regret_pct"]
-    worst = "of the worst agent " if regret.size > 1 else ""
+    best = [*summary["seeds"]].index(summary["policy_seed"])
+    own, error = float(regret[best]), float(steady[best])
+    who = f" (policy.npz: seed {summary['policy_seed']}, the best agent)" if regret.size > 1 else ""
+    worst = f"; worst agent {number(regret.max())} %" if regret.size > 1 else ""
     items = [
-        f"regret {worst}{number(regret.max())} %: cost of the policy above that of the exact optimum",
-        f"steady error at the worst setpoint {worst}{number(steady.max())} {unit}",
+        f"regret {number(own)} %{who}: cost of the policy above that of the exact optimum{worst}",
+        f"steady error at the worst setpoint {number(error)} {unit}",
         f"for comparison, the one-line controller (one period ahead): regret {number(round(law, 4))} %, steady error "
         f"{number(summary['myopic_steady_abs_error'])} {unit}",
     ]
     if kind != "density":
         return Headline(claim, items)
-    if float(regret.max()) > REGRET:
+    if own > REGRET:
         word = f"Not good yet: the regret is above {REGRET:g} %. Train longer, or with another seed"
-    elif float(steady.max()) > STEADY:
+    elif error > STEADY:
         word = f"Nearly optimal, but the steady error is above {STEADY:g} OD. Another seed may be better"
     else:
         word = f"Good: the regret is at most {REGRET:g} % and the steady error at most {STEADY:g} OD"
@@ -161,8 +164,8 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
 
 
 def _spreads(summary: Summary) -> list[tuple[str, tuple[float, float]]]:
-    """Return label and range of the estimates: growth rate; pump flow, % of its setting. Unknown ones are left out."""
-    scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("pump, % of its setting,", 100.0)}
+    """Return label and range of the estimates: growth rate; effect of the pump, % of the model's; only known ones."""
+    scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("effect of the pump, % of the model's,", 100.0)}
     known = [(name, scale, summary[key]) for key, (name, scale) in scales.items() if summary[key] is not None]
     return [(name, (scale * low, scale * high)) for name, scale, (low, high) in known]
 

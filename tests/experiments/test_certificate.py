@@ -126,6 +126,14 @@ def test_a_device_refuses_a_policy_that_is_proven_for_another_culture_than_its_t
     assert bool(other) == (not 0.021 <= mu <= 0.039)
 
 
+@pytest.mark.parametrize("mu", [0.0043, 0.02, 0.022, 0.0385, 0.04])
+def test_a_device_refuses_a_policy_that_is_proven_for_another_culture_than_that_of_the_run(mu, tmp_path):
+    path, run = written(tmp_path / "policy.npz", laws.law()), EnvConfig(mu=mu)
+    asked = laws.law(), settings(laws.law()), path, SCENARIO.setpoints, Bench(), run, "mine"
+    other = [reason for reason in certificate.judged(*asked).refused if f"env_file has {mu}" in reason]
+    assert bool(other) == (not 0.021 <= mu <= 0.039)
+
+
 def test_a_device_tells_the_cases_that_are_not_proven_since_the_pump_cannot_hold_them(tmp_path):
     """At +-42 % growth needs (1.42)^2 of its nominal rate, more than the twice that the pump gives."""
     found = proven(laws.law(), replace(ASKED, uncertainty=0.42))
