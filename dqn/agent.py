@@ -102,7 +102,7 @@ class DQNAgent:
     ) -> None:
         """Store one step of every agent and run the updates that are due.
 
-        Args: as in `Replay.add`; ended: not used, because transitions are replayed separately.
+        Args: as in `Replay.add`; ended: not used, because transitions are replayed one by one.
         """
         self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1

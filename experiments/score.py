@@ -71,7 +71,7 @@ def _found(name: str, task: tasks.Task) -> Any:
         except (ImportError, AttributeError, ValueError) as error:
             raise frame.UserError(f"policy={name}: {error}; {remedy}") from None
         if not callable(call):
-            raise frame.UserError(f"policy={name}: {type(call).__name__} cannot be called; {remedy}")
+            raise frame.UserError(f"policy={name}: {type(call).__name__} is not a function; {remedy}")
         return Function(call, task.actions)
     with frame.refusing(policies.PolicyError):
         policy = policies.load(find_policy(name))

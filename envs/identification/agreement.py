@@ -45,7 +45,7 @@ class Compared:
 
     @property
     def left_min(self) -> float | None:
-        """Minute from which the model's value is wrong up to the end of the run; None if it is right at the end.
+        """Minute from which the model's value is wrong up to the end; None if for fewer than `segments` segments.
 
         The value is wrong in a segment if the interval excludes it and the estimate differs by 10 % or more.
         """

@@ -84,7 +84,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
 
 
 def coverage(config: CalibrateConfig, folder: Path) -> float:
-    """Simulate recordings; return how many 95 % intervals contain the true value, in %, the smaller of mu and tau."""
+    """Simulate recordings; return the % of 95 % intervals that contain the true value, the smaller of mu and tau."""
     protocol, n = config.protocol, config.coverage
     title = f"{n} simulated recordings of {protocol.hours:g} h under {config.law}, {100 * protocol.noise:g} % noise"
     print(title, flush=True)

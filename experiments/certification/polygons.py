@@ -63,7 +63,7 @@ def rounding(network: Network, points: Array) -> Array:
 
     The error of a sum of n products, in any order, is at most g (|h| |W| + |b|) with g = (n + 1) u / (1 - (n + 1) u),
     u = 2^-24 (Higham 2002, Accuracy and Stability of Numerical Algorithms, chapter 3). A relu does not increase errors;
-    an inactive unit passes only the part above zero. On a cell where the network is linear the bound is convex, so the
+    an inactive unit passes only max(0, h + error). On a cell where the network is linear the bound is convex, so the
     largest value at the corners holds in the whole cell.
     """
     h, error = points, UNIT * np.abs(points)

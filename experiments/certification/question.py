@@ -66,8 +66,8 @@ def actions(policy: Policy) -> Array:
 def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     """Return the nominal model: `env` of the config, else the model of the policy's training.
 
-    A policy of (error, growth share) fits every model. For it the default is the bench's model, which converts OD to e
-    for bounds that depend on the OD.
+    A policy of (error, growth share) fits every model; by default it gets the bench's, which converts the bound on the
+    OD's error to one on e.
     Raises: CertificationError if the policy has no model or another control period.
     """
     if policy.observation not in (ABSOLUTE, RELATIVE):

@@ -25,7 +25,7 @@ class Proof:
     holdable: whether the culture always grows without a dose and always shrinks at full pump. band: band of the policy;
     law: band of the one-line controller. half_width, law_half_width: half-widths of these bands.
     allowed: [lowest, highest] allowed state: half-width of the one-line controller plus the margin, (S, 2).
-    entry: periods until the state is within `allowed`, over those of `physical`; inf: never.
+    entry: periods until the state is within `allowed` / those of `physical`; inf: never.
     grows: whether the culture grows under every possible dose while it is below the range of starts.
     """
 

@@ -55,12 +55,12 @@ def missing(package: str = PUBLISHED, folder: str = "") -> str:
     if package.endswith(".whl") and not Path(package).expanduser().is_file():
         return f"no wheel {package}: give the path of one, or a version like {PUBLISHED}"
     if not (home(package, folder) / "done").exists() and _python() is None:
-        return "no Python 3.12 or newer for the vendor's package, from 26.x on 3.13: pyenv install 3.13"
+        return "no Python 3.12 or newer for the vendor's package (26.x: 3.13): pyenv install 3.13"
     return ""
 
 
 def newer() -> str:
-    """Return a line on a version on the package index that is newer than the tested ones; "" if none is found."""
+    """Return a line on a newer version on the package index than those tested; "" if none is found."""
     ask = [sys.executable, "-m", "pip", "index", "versions", "pioreactor", "--python-version", "3.13", "--retries", "0"]
     said = subprocess.run(ask, capture_output=True, text=True, check=False).stdout
     found = re.match(r"pioreactor \(([\d.]+)\)", said)

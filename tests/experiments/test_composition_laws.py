@@ -221,7 +221,7 @@ def test_what_cannot_be_built_is_said_in_one_line():
         registry.build(registry.config("dqn", SHARE), SHARE)
     with pytest.raises(ValueError, match=r"^composition = optimum: needs the whole schedule"):
         registry.build(registry.config("optimum", SHARE), SHARE)
-    with pytest.raises(ValueError, match=r"^policy = .*logit_next.*env=coculture trains"):
+    with pytest.raises(ValueError, match=r"^policy = .*logit_next.*env=coculture"):
         law("dqn", policy=linear_policy(COCULTURE_PREVIEW, "rate"))
     with pytest.raises(ValueError, match=r"^composition.gain = 0.0 degC"):
         law("proportional", gain=0.0)
