@@ -20,7 +20,7 @@ HEAD = f"  {'step':>8} {'from':>12} {'to':>12} {'min':>7} {'at most':>8} {'OD':>
 
 @dataclass(frozen=True)
 class Expected:
-    """Expected course of a step. minutes: duration. ml: medium. od: at its end. longest_ml: ml of its longest course."""
+    """Expected course of a step. minutes: duration. ml: medium. od: at its end. longest_ml: of the longest course."""
 
     minutes: float
     ml: float
