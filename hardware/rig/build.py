@@ -55,7 +55,7 @@ def missing(package: str = PUBLISHED, folder: str = "") -> str:
     if package.endswith(".whl") and not Path(package).expanduser().is_file():
         return f"no wheel {package}: give the path of one, or a version like {PUBLISHED}"
     if not (home(package, folder) / "done").exists() and _python() is None:
-        return "no Python 3.12 or newer for the vendor's package, from 26.x on 3.13: pyenv install 3.13"
+        return "no Python 3.12 or newer for the vendor's package (26.x: 3.13): pyenv install 3.13"
     return ""
 
 
