@@ -85,7 +85,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: Summary) -> Iter
             f"Every plant, {scenario}",
             f"ISE and ITAE of the measured OD, summed over the windows; mean and 95 % interval, n = "
             f"{config.replicates}. Red: score of the sensor's noise alone, for a culture exactly on the setpoint. "
-            "The controller `hold` is not drawn, because its values are far larger.",
+            "The controller hold is not drawn, because its values are far larger.",
         )
         learned = "dqn_adaptive" if any(e.controller == "dqn_adaptive" for e in totals) else "dqn"
         against = [e for e in summary["paired_totals"] if e.scenario == scenario and e[statistics.AGAINST] == learned]
@@ -96,7 +96,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: Summary) -> Iter
                 f"Difference to {learned}, {scenario}",
                 f"Paired over {config.replicates} replicates with the same vials, pumps and noise: mean and 95 % "
                 f"interval, in % of {learned}'s mean. Left of zero: better than {learned}. "
-                "The controller `hold` is not drawn, because its values are far larger.",
+                "The controller hold is not drawn, because its values are far larger.",
             )
 
 

@@ -195,7 +195,7 @@ class ChiBioCase:
             try:
                 r.begin()
                 for repair in r.record.repairs:
-                    self.watch.detect(f"repair:{repair}", "resume")
+                    self.watch.detect(f"repair:{type(repair).__name__}", "resume")
                 for step in r.run(limit):
                     self.watch.step(step)
             except Killed:

@@ -300,7 +300,7 @@ FAULTS: tuple[Fault, ...] = (
           minutes=2.0, wide=True, program=True, error=outage(2.0)),
     Fault("program killed 30 min", "SIGKILL, resumed after 30 min", Rehearsal.kill, ("repair:", "end:killed"),
           minutes=30.0, wide=True, program=True, error=outage(30.0) + STEP_OD),
-    Fault("computer loses power", "torn last rows, resumed after 5 min", Rehearsal.kill, ("repair:torn",), end=torn,
+    Fault("computer loses power", "torn last rows, resumed after 5 min", Rehearsal.kill, ("repair:Torn",), end=torn,
           minutes=5.0, wide=True, program=True, error=outage(5.0)),
     Fault("disk full", "no byte more; freed and resumed after 5 min", full_disk, ("end:journal",), end=free_disk,
           minutes=5.0, wide=True, program=True, error=outage(5.0)),

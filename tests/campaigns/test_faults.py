@@ -71,7 +71,7 @@ def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
         ("started without it in 3 s", "dose", "absent"),
         ("foreign blank", "recovery", "blank"),
         ("program killed 2 min", "dose", "end:killed"),
-        ("computer loses power", "dose", "repair:torn"),
+        ("computer loses power", "dose", "repair:Torn"),
     ],
 )
 def test_what_the_table_declares_happens(name: str, moment: str, reason: str) -> None:

@@ -153,7 +153,7 @@ def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
     text = sections(deployed(tmp_path / "run", "controller=inverse", *vials))
     assert "tau 0.2333, 0.15 of M1 (nominal)" in text
     assert text.count("needs no calibration: the model was right to the end of the run.") == 2
-    gains = re.findall(r"the pump&#39;s gain: last ([\d.]+) \(([\d.]+) to ([\d.]+)\), the model&#39;s 1 ", text)
+    gains = re.findall(r"last estimate ([\d.]+) \(([\d.]+) to ([\d.]+)\), model 1\b", text)
     assert len(gains) == 2
     for gain, low, high in gains:
         assert float(gain) == pytest.approx(1.0, abs=0.12)

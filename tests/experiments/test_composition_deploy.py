@@ -129,7 +129,7 @@ def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
     page = report.write(deployed).read_text()
     assert "ratio_abs_error_last2h" in page
     assert ">composition<" in page
-    assert "of one species" in page
+    assert "the model has one species" in page
 
 
 def test_without_a_composition_nothing_of_it_is_left(tmp_path: Path) -> None:

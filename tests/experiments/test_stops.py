@@ -91,7 +91,7 @@ def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_pat
     run.until_there("a folder/progress.csv", lines=2)
     run.terminate()
     line = run.stopped()
-    assert "keeps checkpoint.pt, progress.csv; go on" in line
+    assert "keeps checkpoint.pt, progress.csv; " in line
     assert "stopping at the end of this episode" in (tmp_path / "out").read_text()
     go_on(run, line)
     config = frame.load(frame.compose("train", SHORT), TrainConfig())
