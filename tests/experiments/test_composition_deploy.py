@@ -377,6 +377,7 @@ def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     words = ["scenario=ratio_hold", "composition=proportional", "backend=chibio", "backend/transport=serial"]
     words += [f"backend.transport.port={line.pc}", "backend.speed=60", f"hydra.run.dir={folder}"]
+    words += ["backend.transport.floor_s=10"]  # a busy machine may answer late
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "experiments.deploy", *words]
     client = subprocess.Popen(
