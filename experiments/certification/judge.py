@@ -39,7 +39,7 @@ class Requirement:
 
     @property
     def title(self) -> str:
-        """Name of the requirement without its case."""
+        """Name of the requirement without the disturbance before its colon."""
         return self.name.split(": ", 1)[-1]
 
     def __str__(self) -> str:

@@ -71,7 +71,7 @@ def add(
 
 
 def build(config: Any, task: Task, streams: Streams, device: str = "cpu") -> Agent:
-    """Make S agents, one for each seed of a stream.
+    """Make S agents, one for each of the streams' seeds.
 
     Raises: ValueError if the config does not fit the task, or if the agent lacks an attribute of `Agent`.
     """

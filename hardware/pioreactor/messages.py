@@ -18,7 +18,7 @@ class FateUnknown(any_kind.PumpFault, says="a requested dose of {ml:.2f} mL ({jo
     """The request is never sent again."""
 class BeingVerified(any_kind.PumpFault, says="the {pump} pump (pin {pin}) is being verified off after {job}, {how}",
     remedy="wait a minute"):
-    """A pump job ended without a report or does not end; the unit does not report that it is on."""
+    """A pump job ended without a report or does not end; the unit does not report that the pump runs."""
 class RunsOn(any_kind.PumpFault, says="the {pump} pump (pin {pin}) still runs after {job}, {how}",
     remedy="pull its plug, or on the unit: {purge} pwm_locks {pin} --as-int"):
     """The unit reports the pump on. The waste pump prevents an overflow. The alarm ends when the pump is off."""
