@@ -200,7 +200,7 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
         key, of = error.args
         above, _, name = key.rpartition(".")
         moved = "; set it under bench" if name in ON_BENCH else ""
-        meant = "" if moved else _meant(name, default, prefix)
+        meant = "" if moved else _meant(key, default, prefix)
         where = f"under {above}" if above else "here"
         raise NoSuchKey(key=key, hint=f"{moved}{meant}", where=where, known=", ".join(of)) from None
 
@@ -217,15 +217,18 @@ def _keys(config: Any, prefix: str) -> Iterator[str]:
             yield from _keys(value, key)
 
 
-def _meant(name: str, config: Any, prefix: str) -> str:
-    """Return "; did you mean KEY?" with the most similar key of the whole tree; "" if no key is similar."""
+def _meant(key: str, config: Any, prefix: str) -> str:
+    """Return a hint: the most similar key of the whole tree, or how to choose a kind without this key; "" if none."""
     keys: dict[str, str] = {}
-    for key in sorted(_keys(config, prefix), key=lambda key: key.count(".")):
-        last = key.rpartition(".")[2]
+    for known in sorted(_keys(config, prefix), key=lambda known: known.count(".")):
+        last = known.rpartition(".")[2]
         initials = "".join(word[0] for word in last.split("_")) if "_" in last else last
         for called in (last, initials):
-            keys.setdefault(called, key)
+            keys.setdefault(called, known)
+    group, _, name = key.rpartition(".")
     near = get_close_matches(name, keys, 1, 0.75)
+    if near and keys[near[0]] == key:  # a key of the preset, which a kind given by GROUP.kind lacks
+        return f"; choose the kind with {group}=NAME, not with {group}.kind=NAME"
     return f"; did you mean {keys[near[0]]}?" if near else ""
 
 
