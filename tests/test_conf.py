@@ -210,6 +210,8 @@ def test_an_unknown_key_in_a_file_is_named(tmp_path):
     stored.write_text("agent: {noisy: true}\n")
     with pytest.raises(frame.UserError, match=r"agent\.noisy: no such key; allowed under agent: .*epsilon_end"):
         frame._stored(stored, "RUN", TrainConfig())
+    with pytest.raises(frame.UserError, match=r"^controller\.estimator: no such key; .* controller=NAME"):
+        load_deploy("controller=adaptive_inverse", "controller.kind=pi")
     with pytest.raises(ValueError, match=r"ablations\.mine\.noisy: no such key"):
         variant(DQNConfig(), "mine", {"noisy": True})
 

@@ -281,7 +281,11 @@ def fitting(signals: Sequence[Signal], actuators: Sequence[Actuator]) -> list[Si
     """
     known = [actuator.name for actuator in actuators]
     for k, signal in enumerate(signals):
-        if missing := [part for part in PARTS if not hasattr(signal, part)]:
+        missing = [part for part in PARTS if not hasattr(signal, part)]
+        memory: Any = signal.memory if "memory" not in missing else None
+        if memory is not None and not hasattr(memory, "remembers"):
+            missing.append("memory.remembers")
+        if missing:
             raise messages.PartMissing(name=signal.name, parts=", ".join(missing))
         if signal.actuator and signal.actuator not in known:
             raise messages.NoActuator(name=signal.name, actuator=signal.actuator, known=", ".join(known))

@@ -241,6 +241,11 @@ def test_a_signal_without_a_part_is_refused() -> None:
     with pytest.raises(PartMissing) as error:
         loop(vials(), SimpleNamespace(name="lamp", actuator="", columns=()))
     assert error.value.fields == {"name": "lamp", "parts": "sees_light, decide, find, dosed, memory"}
+    forgetful = Lone("decide")
+    forgetful.memory = SimpleNamespace(law=1.0)
+    with pytest.raises(PartMissing) as error:
+        loop(vials(), forgetful)
+    assert error.value.fields["parts"] == "memory.remembers"
 
 
 @pytest.mark.parametrize(
