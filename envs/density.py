@@ -1,29 +1,53 @@
-"""The paper's task as a single Gymnasium environment, which can also report the exact optimum."""
+"""The tasks whose episodes can be solved exactly, as single Gymnasium environments that can report the optimum."""
 
-from functools import cache, partial
+from abc import abstractmethod
+from functools import lru_cache
 from typing import Any
 
 from envs.gym_adapter import EpisodeEnv
-from envs.optimum import solve_episode
+from envs.integrators import Array
+from envs.optimum import EpisodeOptimum, solve_episode, solve_relative
+from envs.relative import RelativeVectorEnv
 from envs.vector_env import BioreactorVectorEnv
 
 
-class BioreactorEnv(EpisodeEnv):
-    """`BioreactorVectorEnv` as a single environment. Version history: v0, the task of the paper.
+class SolvedEnv(EpisodeEnv):
+    """Environment of two numbers, of which the second stays the same for an episode.
 
-    Args: optimum: whether `info` also contains the optimal "optimal_action" (index) and "optimal_rate" (mL/s).
+    Args: optimum: whether `info` also contains the optimal "optimal_action" (index) and "optimal_rate" (its pump rate).
     """
-
-    batch = BioreactorVectorEnv
 
     def __init__(self, config: Any = None, *, optimum: bool = False, **given: Any) -> None:
         super().__init__(config, **given)
-        self._optimum = cache(partial(solve_episode, self.config)) if optimum else None
+        self._optimum = lru_cache(32)(self._solve) if optimum else None
+
+    @abstractmethod
+    def _solve(self, held: float) -> tuple[EpisodeOptimum, Array]:
+        """Solve the episode with this second number; return the optimum and the pump rate of each action."""
 
     def _info(self) -> dict[str, Any]:
-        info = super()._info()
+        info, (first, held) = super()._info(), self._batch.state[0, :2]
         if self._optimum is not None:
             left = self.config.episode_steps - self._batch._steps[0]
-            best = self._optimum(info["setpoint"]).act(self._batch.state[:, 0], left)
-            info |= {"optimal_action": int(best[0]), "optimal_rate": float(self.config.pump_rates()[best[0]])}
+            optimum, rates = self._optimum(float(held))
+            best = int(optimum.act(first[None], left)[0])
+            info |= {"optimal_action": best, "optimal_rate": float(rates[best])}
         return info
+
+
+class BioreactorEnv(SolvedEnv):
+    """`BioreactorVectorEnv` as a single environment; "optimal_rate" in mL/s. Version history: v0, the paper's task."""
+
+    batch = BioreactorVectorEnv
+
+    def _solve(self, held: float) -> tuple[EpisodeOptimum, Array]:
+        return solve_episode(self.config, held), self.config.pump_rates()
+
+
+class RelativeEnv(SolvedEnv):
+    """`RelativeVectorEnv` as a single environment; "optimal_rate" is a fraction of full pump. Version history: v0."""
+
+    batch = RelativeVectorEnv
+
+    def _solve(self, held: float) -> tuple[EpisodeOptimum, Array]:
+        return solve_relative(self.config, held, self.config.episode_steps), self.config.levels()

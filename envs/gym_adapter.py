@@ -10,7 +10,7 @@ from envs.vector_env import EpisodeSpec, EpisodeVectorEnv
 
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.density:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
-    "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
+    "Relative-v0": ("envs.density:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
     "BioreactorPreview-v0": ("envs.preview:PreviewEnv", "envs.preview:PreviewVectorEnv", {}),
 }
 """Name -> class of the single and of the vector environment, changes to the task's defaults. Guests add entries."""

@@ -18,7 +18,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.gym_adapter import EpisodeEnv
 from envs.integrators import Array
 from envs.vector_env import EpisodeVectorEnv
 
@@ -93,9 +92,3 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
         self.state[:, 0] += self.state[:, 1] - (actions if self.continuous else self._levels[actions])
         reward: Array = relative_reward(self.state[:, 0])
         return reward
-
-
-class RelativeEnv(EpisodeEnv):
-    """`RelativeVectorEnv` as a single environment. Version history: v0."""
-
-    batch = RelativeVectorEnv

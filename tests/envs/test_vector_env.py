@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode
 
 import envs  # registers the environment
 from envs.gym_adapter import REGISTERED
-from envs.optimum import solve_episode
+from envs.optimum import solve_episode, solve_relative
+from envs.relative import RelativeConfig
 from envs.task import EnvConfig, step_factors
 from envs.vector_env import BioreactorVectorEnv
 
@@ -43,16 +44,24 @@ def test_a_task_is_what_gymnasium_asks_and_continues_from_its_state(name):
         np.testing.assert_array_equal(many.step(np.full(3, action))[0], other.step(np.full(3, action))[0])
 
 
-def test_the_optimums_actions_in_info_cost_what_the_optimum_costs():
-    env = gymnasium.make(ID, optimum=True, episode_steps=20)
+@pytest.mark.parametrize(
+    ("task", "grid", "solve"),
+    [
+        (ID, EnvConfig.pump_rates, solve_episode),
+        ("Relative-v0", RelativeConfig.levels, lambda config, share: solve_relative(config, share, 20)),
+    ],
+)
+def test_the_optimums_actions_in_info_cost_what_the_optimum_costs(task, grid, solve):
+    env = gymnasium.make(task, optimum=True, episode_steps=20)
     _, info = env.reset(seed=3)
-    best, total, over = solve_episode(env.unwrapped.config, info["setpoint"]), 0.0, False
-    ods, _ = best.rollout(np.array([info["od"]]))
+    first, held, *_ = info.values()
+    best, total, over = solve(env.unwrapped.config, held), 0.0, False
+    states, _ = best.rollout(np.array([first]))
     while not over:
-        assert info["optimal_rate"] == env.unwrapped.config.pump_rates()[info["optimal_action"]]
+        assert info["optimal_rate"] == grid(env.unwrapped.config)[info["optimal_action"]]
         _, reward, _, over, info = env.step(info["optimal_action"])
         total += reward
-    assert total == pytest.approx(-np.sum((ods[:, 0] - best.target) ** 2))
+    assert total == pytest.approx(-np.sum((states[:, 0] - best.target) ** 2))
 
 
 def pair(n, mode, **overrides):
