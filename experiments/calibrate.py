@@ -78,6 +78,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     for what in content["rejected"]:
         print(f"  rejected rows {what['rows']} ({what['n']}): {what['reason']}")
     print("\n".join(f"  {note}" for note in recording.notes), f"files {environment}, {written}", sep="\n")
+    print(f"next, train on this model: python -m experiments.train env_file={environment}")
     print(f"next, for a page with all results: python -m experiments.report run={folder}")
     return result.pmse_pct
 

@@ -115,7 +115,11 @@ def score(config: ScoreConfig, folder: Path) -> float:
         for name, figure in drawn.items():
             events.picture(f"figures/{name}", charts.save(figure, folder / "figures", name), 0)
     log.info("%s, %s", config.policy, task.description)
-    log.info("regret %.4g %% (one-line controller: %.4g %%)", summary["regret_pct"], summary["myopic_regret_pct"])
+    log.info(
+        "regret %.4g %% (one-line controller: %.4g %%)",
+        summary["regret_pct"],
+        round(summary["myopic_regret_pct"], 4) + 0.0,
+    )
     log.info("steady error %.4g %s (optimum: %.4g)", found.steady_abs_error[0], task.unit, grid.optimum_steady)
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
     return float(found.regret_pct[0])

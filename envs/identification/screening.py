@@ -31,6 +31,7 @@ FROZEN_ROWS = 10
 FEWEST_READINGS = 10  # least number of readings for an estimate
 NOISY_FACTOR = 6.0
 WEEK_MIN = 10080
+MANY_ROWS = 1000  # more rows, at half a minute or less, are merged: pumps often run for longer than such an interval
 LATE_MIN = 0.3  # min before the last reading of a merged minute from which readings are used
 GAP_MIN = 5.0  # a longer pause, also longer than five usual intervals, is a gap: the pump's action in it is unknown
 
@@ -101,11 +102,11 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def merged(series: Series, longest: int = WEEK_MIN) -> Series:
+def merged(series: Series, longest: int = MANY_ROWS) -> Series:
     """Merge the rows of each minute if rows are half a minute or less apart and more than `longest` in number.
 
     A merged row has the time of its last reading and the median of the readings in the 18 s up to this time. So the
-    order of doses and readings is kept. The pumped volume is kept, too. `longest` is the number of minutes in a week.
+    order of doses and readings is kept. The pumped volume is kept, too.
     """
     if len(series.time) <= longest:
         return series

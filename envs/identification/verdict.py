@@ -107,7 +107,8 @@ def judged(
         return Verdict("use", f"{known}; all checks passed", ""), ()
     what, then = against[0]
     more = f" ({len(against) - 1} more below)" if len(against) > 1 else ""
-    return Verdict("use with care", f"{known}; {what}{more}", then), tuple("; ".join(a) for a in against)
+    told = (what if k and then == against[k - 1][1] else f"{what}; {then}" for k, (what, then) in enumerate(against))
+    return Verdict("use with care", f"{known}; {what}{more}", then), tuple(told)
 
 
 def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:

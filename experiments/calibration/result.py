@@ -147,6 +147,8 @@ def environment_yaml(result: Calibration, source: str) -> str:
 
 def plant_of(found: Twin) -> PlantConfig:
     """Convert the twin to a plant. Raises: ValueError with the value that is out of range for a plant."""
+    if (negative := found.knot_min[found.mu.value < 0.0]).size:
+        raise ValueError(f"the growth rate is negative {negative[0] / 60.0:.1f} h after the first row used")
     volume = Bench.volume_ml  # a recording determines only flow over volume: the file has both
     flow, knots = volume / (60.0 * found.tau.value), _numbers(found.knot_min)
     growth = GrowthConfig(mu=_mean(found.mu.value), knots_min=knots, knots_mu=_numbers(found.mu.value))

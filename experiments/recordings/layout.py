@@ -178,4 +178,7 @@ def _unit(name: str) -> str:
 
 
 def _there(first: Sequence[str]) -> str:
-    return f"found {', '.join(first)[:2000]}; give its name as columns.KEY=NAME, KEY one of {', '.join(COLUMNS)}"
+    return (
+        f"found {', '.join(first)[:2000]}; give its name as columns.KEY=NAME, KEY one of {', '.join(COLUMNS)} (dose: "
+        "of each row, fed: the total so far, both in mL, uL or pump seconds)"
+    )

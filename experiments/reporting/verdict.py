@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from envs.bench import Bench
 from experiments.reporting.curves import BAND, CALLED, ERROR_UNITS, signals_in
 from experiments.reporting.tables import count, number
 
@@ -65,9 +66,11 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     if kind != "density":
         return Headline(claim, items)
     if own > REGRET:
-        word = f"Not good yet: the regret is above {REGRET:g} %. Train longer, or with another seed"
+        word = (
+            f"Not good yet: the regret is above {REGRET:g} %. Train longer, or train n_agents=8 seeds and keep the best"
+        )
     elif error > STEADY:
-        word = f"Nearly optimal, but the steady error is above {STEADY:g} OD. Another seed may be better"
+        word = f"Nearly optimal, but the steady error is above {STEADY:g} OD. The best of n_agents=8 may be better"
     else:
         word = f"Good: the regret is at most {REGRET:g} % and the steady error at most {STEADY:g} OD"
     return Headline(claim, items, f"{word}.")
@@ -118,13 +121,14 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items = [
         f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
         f"{number(summary['doubling_min'])} min",
-        f"tau {number(tau[0])}, 95 % interval {number(tau[1])} to {number(tau[2])}",
+        f"tau {number(tau[0])}, 95 % interval {number(tau[1])} to {number(tau[2])}; in {Bench.volume_ml:g} mL the "
+        f"pump then delivers {number(Bench.volume_ml / 60.0 / tau[0])} times the stated flow (recording, pump_ml_s)",
         f"PMSE {number(summary['pmse_pct'])} % (squared residual / squared OD); {summary['n_used']} readings used, "
         f"{summary['n_rejected']} rejected",
     ]
     items += [
         f"the first half's fit predicts the second half {a['minutes']:.0f} min ahead with rms error "
-        f"{number(a['model_pct'], 2)} % (constant OD {number(a['od_stays_pct'], 2)} %, constant slope "
+        f"{number(a['model_pct'], 2)} % (if OD stayed constant: {number(a['od_stays_pct'], 2)} %; if its slope did: "
         f"{number(a['same_slope_pct'], 2)} %)"
         for a in summary.get("validation", {}).get("ahead", ())
     ]
@@ -154,8 +158,10 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items += [
         f"doses at setpoint OD {number(summary['setpoint'])}, % of readings: both {doses['both']:.0f}, neither "
         f"{doses['neither']:.0f}, only device {doses['device']:.0f}, only controller {doses['controller']:.0f}",
-        f"rejected {number(summary['not_believed_pct'])} %; filter alarm {number(summary['filter_alarm_pct'])} %",
-        "interlock alarms: " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
+        f"rejected {number(summary['not_believed_pct'])} %; the filter alarm acts in "
+        f"{number(summary['filter_alarm_pct'])} %",
+        "alarms and notes, number of readings: "
+        + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
     ]
     if "none" in twin:
         return Headline(claim, items, f"No closed loop on a twin: {twin['none']}.")
@@ -165,7 +171,10 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
 
 def _spreads(summary: Summary) -> list[tuple[str, tuple[float, float]]]:
     """Return label and range of the estimates: growth rate; effect of the pump, % of the model's; only known ones."""
-    scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("effect of the pump, % of the model's,", 100.0)}
+    scales = {
+        "mu": ("growth rate, 1/min,", 1.0),
+        "gain": ("effect of the pump, % of that in the model (env_file; nominal without),", 100.0),
+    }
     known = [(name, scale, summary[key]) for key, (name, scale) in scales.items() if summary[key] is not None]
     return [(name, (scale * low, scale * high)) for name, scale, (low, high) in known]
 

@@ -298,7 +298,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         threading.Thread(target=orphaned, daemon=True).start()
     print(
         f"emulator ready: http://{arguments.host}:{server.port} reactors {arguments.reactors} "
-        f"speed {arguments.speed:g} control http://{arguments.host}:{server.control_port}",
+        f"speed {arguments.speed:g} (deploy backend=chibio backend.url=http://{arguments.host}:{server.port} "
+        f"backend.speed={arguments.speed:g}) control http://{arguments.host}:{server.control_port}",
         flush=True,
     )
     server.run()
