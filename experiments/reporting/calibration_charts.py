@@ -119,8 +119,7 @@ def drift_figure(result: Calibration, title: str) -> Figure:
     axes[0].set_title(title)
     axes[1].set_xlabel("time, h")
     axes[1].set_xlim(-0.01 * time[-1], 1.01 * time[-1])
-    row = np.pad(result.screened.series.row, 1, "reflect", reflect_type="odd")
-    at = np.pad(time, 1, "reflect", reflect_type="odd")
+    at, row = (np.concatenate([2 * v[:1] - v[-1:], v, 2 * v[-1:] - v[:1]]) for v in (time, result.screened.series.row))
     ways = (lambda hour: np.interp(hour, at, row)), (lambda number: np.interp(number, row, at))
     axes[0].secondary_xaxis("top", functions=ways).set_xlabel("row")
     return figure
