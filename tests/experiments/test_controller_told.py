@@ -248,6 +248,12 @@ def test_what_a_device_dosed_by_itself_is_in_the_next_row_of_its_own_and_off_wha
     assert np.sum(law.told, axis=0).tolist() == pytest.approx([0.24, 1.88])
 
 
+def test_a_controller_is_told_of_a_dose_as_in_the_volume_of_its_model_with_what_is_kept_of_it() -> None:
+    law = Shown()
+    Density(law, scale=np.array([0.6, 1.25])).dosed(np.array([0.3, 0.5]), np.array([0.12, -0.25]), np.array([1, 1]))
+    assert law.told == [pytest.approx([0.7, 0.2])]
+
+
 def test_the_heater_of_the_vial_that_is_too_warm_goes_off_and_that_of_the_other_stays() -> None:
     reactors = Turns(*((float(k), 0.5 + 1e-3 * k, 0.4 + 1e-3 * k) for k in range(4)), warm=(37.0, 48.0))
     loop, _ = turns(reactors, *[Scenario((0.5,), (60.0,), (36.0,))] * 2)

@@ -106,6 +106,13 @@ def test_what_a_step_gives_by_a_spare_pump_is_owed_by_its_rate_or_volume(name: s
     assert sorted(doses(Supply(schedules, 1.2), minutes, phase, believed)) == sorted(expected)
 
 
+def test_what_a_signal_asked_for_stays_owed_at_a_new_step_and_what_a_step_asked_for_does_not() -> None:
+    """0.4 mL of each pump are owed when the second step begins, at which pump 4 gets 0.55 mL at once."""
+    supply = Supply([steps("pump4 6 mL/h", "pump4 0.55 mL", first_min=5.0)], 1.2, asked=[3])
+    supply.ask(3, np.array([6.0 / 3600.0]))
+    assert doses(supply, range(6), SECOND_AT_4) == [(4, 0, 4, 0.55), (5, 0, 3, 0.5)]
+
+
 def test_where_no_dose_may_be_decided_nothing_is_owed_or_given() -> None:
     supply = Supply([steps("pump4 1 mL")], 1.2)
     pump, ml = supply.due(np.array([np.nan]), np.array([-1]), np.array([False]))

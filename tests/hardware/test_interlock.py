@@ -10,11 +10,13 @@ import pytest
 from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
+from hardware.actuator import SPARE, THERMOSTAT, Actuator
 from hardware.emulator.device import plant_preset
 from hardware.messages import Fault, LinkFault
 from hardware.reactor import Measurement, Receipt, Vitals
 from hardware.safety.config import DONE, Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Ruling, kinds_of
+from hardware.safety.messages import PAUSES, NoDilutionPause
 
 
 class Drive:
@@ -203,13 +205,35 @@ def test_a_weak_pump_is_found(spoilt: str, value: float, mu: float | None, n: in
     assert found.sum() >= least
 
 
+@pytest.mark.parametrize("pause", PAUSES)
+def test_a_refilled_bottle_ends_the_pause_of_a_feed_that_did_not_dilute_and_no_other(pause: type[Fault]) -> None:
+    held = Drive().interlock.state() | {"_hold_until_s": [3600.0], "_hold_kind": [float(PAUSES.index(pause))]}
+    drive = Drive()
+    drive.interlock.restore(held)
+    assert drive().rate[0] == 0.0
+    drive.interlock.refilled(0, 500.0)
+    assert (drive(od=0.501).rate[0] > 0.0) == (pause is NoDilutionPause)
+
+
+def test_each_signal_s_command_is_cut_to_the_limits_of_its_own_actuator_and_told() -> None:
+    drive = Drive(SafetyConfig(composition_low=30.0, composition_high=34.0), Bench(max_rate=0.013))
+    lamp = Actuator("lamp", "%", 5.0, 85.0)
+    limits = {SPARE[3]: (0.0, 0.013), SPARE[4]: (0.0, 0.013), THERMOSTAT: (30.0, 34.0), lamp: (5.0, 85.0)}
+    for actuator, (low, high) in limits.items():
+        for asked, given in ((np.nan, np.nan), (low, low), (low - 1.0, low), (high + 0.004, high)):
+            np.testing.assert_array_equal(drive.interlock.command(actuator, np.array([asked])), [given])
+    assert [fault.fields["actuator"] for fault in drive().faults[0]] == [actuator.name for actuator in limits]
+    assert drive(od=0.501).faults[0] == ()
+
+
 # -- attacked --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "period_s"), [(0, 60.0), (1, 30.0), (2, 120.0)])
+def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int, period_s: float) -> None:
     rng = np.random.default_rng(seed)
-    n, c, bench = 8, SafetyConfig(ml_per_hour=30.0, silent=1e5), Bench(bottle_ml=150.0)
+    n, bench = 8, Bench(bottle_ml=150.0, period_s=period_s)
+    c = SafetyConfig(ml_per_minute=1.4 * bench.max_rate * period_s, ml_per_hour=30.0, silent=1e5)
     interlock = Interlock(n, c, bench)
     now, fed = 0.0, np.zeros(n)
     doses: list[tuple[float, np.ndarray]] = []
@@ -236,7 +260,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         assert all(v.rate[i] == 0.0 for i in range(n) if faults[i] is not None)
         told = zip(v.reasons, v.kinds, v.response, strict=True)
         assert all((line is None) == (not kinds) or code >= 3 for line, kinds, code in told)
-        feed = v.rate * 60.0
+        feed = v.rate * period_s
         waste = np.where(rng.random(n) < 0.1, 0.0, 4.0 * feed + 4.0)
         interlock.confirm(Receipt(feed, (), waste), now)
         level = np.where(waste > 0.0, np.maximum(level + feed - waste, 20.0), level + feed)
@@ -244,7 +268,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         fed += feed
         assert np.all(level <= 25.0 + 1e-9)
         assert np.all(fed <= bench.bottle_ml + 1e-9)
-        assert np.all(sum(f for t, f in doses if now - t < 60.0) <= 3.0 + 1e-9)
+        assert np.all(sum(f for t, f in doses if now - t < 60.0) <= c.ml_a_minute(bench) + 1e-9)
         assert np.all(sum(f for t, f in doses[-200:] if now - t < 3540.0) <= c.ml_per_hour + 1e-9)
         if rng.random() < 0.01:  # the program dies and comes back
             state = filed(interlock)

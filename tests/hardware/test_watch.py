@@ -15,8 +15,10 @@ from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import Reply
+from hardware.messages import LinkFault
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Mailbox
+from hardware.reactor import Measurement, Vitals
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import kinds_of
 from hardware.watch import pioreactor
@@ -79,6 +81,21 @@ def test_a_sound_day_is_quiet() -> None:
     assert told(Beside(seed=1).run(24.0)) == set()
 
 
+def test_a_fault_is_told_in_its_third_sample_in_a_row_of_its_own_reactor() -> None:
+    interlock, n = WatchedInterlock(2, SafetyConfig()), 2
+    steps = ("x.", ".x", "x.", "xx", "xx", ".x", "x.", "x.")
+    lines = []
+    for minute, faults in enumerate(steps):
+        vitals = Vitals(
+            np.zeros(n), np.full(n, 9000.0), tuple(LinkFault("x") if one == "x" else None for one in faults)
+        )
+        od = np.full(n, 0.5 + 1e-3 * (minute % 5))
+        m = Measurement(np.full(n, 60.0 * minute), od, np.full(n, 37.0), np.full(n, True), vitals)
+        reasons = interlock.check(m, np.zeros(n), np.full(n, 0.5), np.full(n, np.nan), 60.0 * minute).reasons
+        lines.append([bool(reason) for reason in reasons])
+    assert lines == [[k == 4, k == 5] for k in range(len(steps))]
+
+
 class Unit(VirtualClock):
     """Time, in which a Pioreactor's turbidostat doses 1 mL above OD 0.5; its pump may fail. It says what it does."""
 
@@ -94,7 +111,8 @@ class Unit(VirtualClock):
             self.od *= np.exp(0.02 * 5.0 / 60.0)
             self.say("od_reading/ods", ods={"2": {"od": self.od + self._rng.normal(0.0, 0.002), "calibrated": 0}})
             if self.od > 0.5 and self._next_s % 60.0 < 5.0:
-                self.say("dosing_events", volume_change=1.0, event="add_media", source_of_event="turbidostat")
+                fluid = ("add_media", "add_alt_media")[int(self._next_s) // 60 % 2]
+                self.say("dosing_events", volume_change=1.0, event=fluid, source_of_event="turbidostat")
                 self.od *= np.exp(-1.0 / 20.0) if self.sound else 1.0
 
     def say(self, rest: str, **what: object) -> None:
