@@ -118,7 +118,7 @@ def drift_figure(result: Calibration, title: str) -> Figure:
         ax.legend(loc="best", ncols=3)
     axes[0].set_title(title)
     axes[1].set_xlabel("time, h")
-    axes[1].set_xlim(-0.01 * time[-1], 1.01 * time[-1])
+    axes[1].set_xlim(time[0] - 0.01 * np.ptp(time), time[-1] + 0.01 * np.ptp(time))
     at, row = (np.concatenate([2 * v[:1] - v[-1:], v, 2 * v[-1:] - v[:1]]) for v in (time, result.screened.series.row))
     ways = (lambda hour: np.interp(hour, at, row)), (lambda number: np.interp(number, row, at))
     axes[0].secondary_xaxis("top", functions=ways).set_xlabel("row")
