@@ -20,7 +20,7 @@ from experiments.comparison import studies
 from experiments.comparison import trials as trials_module
 from experiments.comparison.config import TABLE_2, BenchmarkConfig
 from experiments.comparison.run import learned, with_seeds
-from experiments.comparison.trials import Cell, DensityTrial, Loops, cells, run_trial, windows
+from experiments.comparison.trials import Cell, DensityTrial, Loops, Window, cells, run_trial, windows
 from experiments.laws import registry
 from experiments.reporting import charts
 from experiments.training import run as training
@@ -153,6 +153,11 @@ def synthetic(controller: str, offset: np.ndarray) -> DensityTrial:
         cell, schedule, np.arange(3.0), 37.0 * ones, od, od - 0.001, rate,
         np.tile([1.0, 1.6, 2.4], (n, 1)), np.zeros(n), np.zeros(n, dtype=bool),
     )  # fmt: skip
+
+
+def test_the_medium_of_a_window_is_that_from_its_start_to_its_end_at_any_period():
+    slow = replace(synthetic("pi", np.zeros(2)), minute=np.array([0.0, 2.0, 4.0]))
+    np.testing.assert_allclose(slow.media(Window("1", 1.0, 2.0, 4.0)), 2.4 - 1.6)
 
 
 @pytest.mark.parametrize(("n", "low", "high"), [(10, 2, 9), (25, 8, 18), (64, 24, 41)])

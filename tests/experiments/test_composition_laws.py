@@ -261,7 +261,7 @@ MIRRORED = PairConfig(  # the default pair with T for 65 - T: warmth makes the s
 )
 
 
-@pytest.mark.parametrize("kind", ["pi", "proportional", "inverse_dynamics", "bang_bang"])
+@pytest.mark.parametrize("kind", ["pi", "proportional", "inverse_dynamics", "bang_bang", "midpoint"])
 def test_where_warmth_makes_the_second_gain_every_target_is_mirrored(kind):
     """Long at a limit, so that an integrator which does not rest there is seen when the sign turns."""
     here = law(kind)
