@@ -1,5 +1,6 @@
 """Comparison of composition controllers: closed loops, numbers, figures and page."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -90,7 +91,7 @@ class ShareCell(Cell):
 
 @dataclass(frozen=True, eq=False)
 class ShareTrial(Trial):
-    """Trial of a composition controller, minute by minute; arrays (N, K).
+    """Trial of a composition controller, sample by sample; arrays (N, K).
 
     foresight: whether the controller used announcements. setpoint: setpoint of the share, (K,), nan without one.
     share, od: true share and OD. estimate, low, high: estimated share and its 95 % band.
@@ -181,9 +182,10 @@ def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> 
     return found
 
 
-def abs_error(trial: ShareTrial, since: int = 0) -> Array:
-    """Return the mean |r - setpoint| over all times with a setpoint, (N,). Args: since: first minute."""
-    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, since:], axis=1))
+def abs_error(trial: ShareTrial, last_min: float = math.inf) -> Array:
+    """Return the mean |r - setpoint| over the last minutes, by default all, with a setpoint, (N,)."""
+    rows = trial.minute > trial.minute[-1] - last_min
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, rows], axis=1))
 
 
 def last_hours(trial: ShareTrial) -> Array:
@@ -191,10 +193,11 @@ def last_hours(trial: ShareTrial) -> Array:
 
     A controller with preview leaves a setpoint before the change, so this does not measure how well it holds.
     """
-    held, edges = np.zeros(trial.minute.size, dtype=np.bool_), trial.schedule.edges.astype(int)
-    for start, end in pairwise(edges):
-        if np.unique(trial.setpoint[start:end]).size == 1 and np.isfinite(trial.setpoint[start]):
-            held[max(start, end - LAST_MIN) : end] = True
+    held = np.zeros(trial.minute.size, dtype=np.bool_)
+    for start, end in pairwise(trial.schedule.edges):
+        inside = (trial.minute >= start) & (trial.minute < end)
+        if np.unique(trial.setpoint[inside]).size == 1 and np.isfinite(trial.setpoint[inside]).all():
+            held |= inside & (trial.minute >= end - LAST_MIN)
     error = np.abs(trial.share - trial.setpoint)[:, held]
     return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
 
@@ -209,7 +212,7 @@ def share_row(trial: ShareTrial) -> Row:
         ABS_ERROR_SD: error.sd,
         CI95: error.ci95,
         LAST_2H: Spread(last_hours(trial)).mean,
-        LAST_DAY: Spread(abs_error(trial, -DAY_MIN)).mean if days else float("nan"),
+        LAST_DAY: Spread(abs_error(trial, DAY_MIN)).mean if days else float("nan"),
         RMS: float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
         COVERS: float(inside.mean()),
         OD_MIN: float(trial.od.min()),
@@ -224,12 +227,13 @@ def shares(trials: Sequence[ShareTrial]) -> Figure:
     columns = len(trials)
     figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
     for k, trial in enumerate(trials):
-        top, bottom, hours = axes[k], axes[columns + k], trial.minute[::STEP] / 60.0
+        shown = slice(None, None, max(1, round(STEP / np.diff(trial.minute).max())))
+        top, bottom, hours = axes[k], axes[columns + k], trial.minute[shown] / 60.0
         for ax, values, colour in ((top, trial.share, COLOURS[0]), (bottom, trial.temperature, COLOURS[1])):
-            low, middle, high = np.quantile(values[:, ::STEP], (0.05, 0.5, 0.95), axis=0)
+            low, middle, high = np.quantile(values[:, shown], (0.05, 0.5, 0.95), axis=0)
             ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
             ax.plot(hours, middle, color=colour, linewidth=1.2)
-        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
+        top.plot(hours, trial.setpoint[shown], color="black", linewidth=1.0, linestyle="--")
         top.set_title(Row.of(trial.names()).law)
         bottom.set_xlabel("hours")
     axes[0].set(ylabel="share of the second species", ylim=(0.0, 1.0))

@@ -56,7 +56,7 @@ class SafetyConfig:
 
     ml_per_minute: float | None = setting(
         None,
-        "feed budget per minute; null: 2.5 times the largest dose, as 60 s can contain two doses",
+        "feed budget per minute; null: full feed and 1.5 of the largest doses, as 60 s can contain one dose more",
         "mL",
         above=0.0,
         below=math.inf,
@@ -116,7 +116,8 @@ class SafetyConfig:
 
     def ml_a_minute(self, bench: Bench) -> float:
         """Return the feed budget of a minute, mL."""
-        return 2.5 * (bench.max_rate * bench.period_s) if self.ml_per_minute is None else self.ml_per_minute
+        doses = max(1.0, 60.0 / bench.period_s) + 1.5
+        return doses * bench.max_rate * bench.period_s if self.ml_per_minute is None else self.ml_per_minute
 
     @property
     def targets(self) -> tuple[float, float]:

@@ -75,9 +75,10 @@ def test_a_calibrated_estimator_begins_with_each_reactor_s_own_sensor():
     assert len(np.unique(known[..., FACTOR] / factor[:, None])) == 12
 
 
-def test_the_last_two_hours_are_those_of_every_window():
+@pytest.mark.parametrize("period_min", [1.0, 2.0, 0.5])
+def test_the_last_two_hours_are_those_of_every_window(period_min):
     """Of 300 min, of 300 min in which the setpoint waves, of 90 min, which are all of them, and of 300 min."""
-    minute = np.arange(991.0)
+    minute = np.arange(0.0, 991.0, period_min)
     setpoint = np.select([minute < 300, minute < 600, minute < 690], [0.3, 0.4 + 0.1 * np.sin(minute), 0.5], 0.7)
     late = [(180, 300), (600, 690), (870, 990)]
     share = setpoint + np.select([(minute >= a) & (minute < b) for a, b in late], [0.01, 0.03, 0.05], 0.2)

@@ -277,6 +277,18 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int, peri
     assert fed.sum() > 2.0
 
 
+@pytest.mark.parametrize("period_s", [10.0, 20.0, 25.0, 60.0, 120.0])
+def test_full_feed_is_within_the_budget_of_a_minute_at_every_period(period_s: float) -> None:
+    interlock = Interlock(1, SafetyConfig(), Bench(period_s=period_s))
+    late = np.random.default_rng(0).uniform(0.0, 0.1, 30) * period_s
+    for k, now in enumerate(period_s * np.arange(30) + late):
+        m = Measurement(np.array([now]), np.array([0.5 + 1e-3 * (k % 7)]), np.array([37.0]), np.array([True]))
+        verdict = interlock.check(m, np.array([0.02]), np.array([0.45]), np.array([37.0]), now)
+        assert "budget" not in verdict.kinds[0]
+        feed = verdict.rate * period_s
+        interlock.confirm(Receipt(feed, (), 4.0 * feed + 4.0), now)
+
+
 def test_after_a_resume_a_reactor_is_stale_only_once_it_had_its_chance() -> None:
     def check(lock: Interlock, now: float, fresh: list[bool], age_s: list[float]) -> tuple[tuple[str, ...], ...]:
         vitals = Vitals(np.array(age_s), np.full(2, 9000.0), (None, None))
