@@ -1,4 +1,4 @@
-"""The tasks whose episodes can be solved exactly, as single Gymnasium environments that can report the optimum."""
+"""The density and the relative task as single Gymnasium environments, which can also report the exact optimum."""
 
 from abc import abstractmethod
 from functools import lru_cache
@@ -12,7 +12,7 @@ from envs.vector_env import BioreactorVectorEnv
 
 
 class SolvedEnv(EpisodeEnv):
-    """Environment of two numbers, of which the second stays the same for an episode.
+    """Environment that observes two numbers, of which the second is constant within an episode.
 
     Args: optimum: whether `info` also contains the optimal "optimal_action" (index) and "optimal_rate" (its pump rate).
     """

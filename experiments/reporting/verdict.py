@@ -66,9 +66,7 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Headline:
     if kind != "density":
         return Headline(claim, items)
     if own > REGRET:
-        word = (
-            f"Not good yet: the regret is above {REGRET:g} %. Train longer, or train n_agents=8 seeds and keep the best"
-        )
+        word = f"Not good yet: the regret is above {REGRET:g} %. Train longer, or with n_agents=8, which keeps the best"
     elif error > STEADY:
         word = f"Nearly optimal, but the steady error is above {STEADY:g} OD. The best of n_agents=8 may be better"
     else:
@@ -158,10 +156,8 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
     items += [
         f"doses at setpoint OD {number(summary['setpoint'])}, % of readings: both {doses['both']:.0f}, neither "
         f"{doses['neither']:.0f}, only device {doses['device']:.0f}, only controller {doses['controller']:.0f}",
-        f"rejected {number(summary['not_believed_pct'])} %; the filter alarm acts in "
-        f"{number(summary['filter_alarm_pct'])} %",
-        "alarms and notes, number of readings: "
-        + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
+        f"rejected {number(summary['not_believed_pct'])} %; filter alarm acts: {number(summary['filter_alarm_pct'])} %",
+        "alarms and notes (readings): " + (", ".join(f"{k} {n}" for k, n in summary["interlock"].items()) or "none"),
     ]
     if "none" in twin:
         return Headline(claim, items, f"No closed loop on a twin: {twin['none']}.")
@@ -171,10 +167,7 @@ def _replay(summary: Summary, config: Mapping[str, Any]) -> Headline:
 
 def _spreads(summary: Summary) -> list[tuple[str, tuple[float, float]]]:
     """Return label and range of the estimates: growth rate; effect of the pump, % of the model's; only known ones."""
-    scales = {
-        "mu": ("growth rate, 1/min,", 1.0),
-        "gain": ("effect of the pump, % of that in the model (env_file; nominal without),", 100.0),
-    }
+    scales = {"mu": ("growth rate, 1/min,", 1.0), "gain": ("effect of the pump, % of the model's (env_file),", 100.0)}
     known = [(name, scale, summary[key]) for key, (name, scale) in scales.items() if summary[key] is not None]
     return [(name, (scale * low, scale * high)) for name, scale, (low, high) in known]
 

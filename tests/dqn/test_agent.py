@@ -49,11 +49,6 @@ class Shifted:
         batch.r_t.add_(drawn[..., 0])
 
 
-def _trainer(config: DQNConfig, seeds: range) -> Trainer:
-    agent = DQNAgent(config, 3, 3, streams(seeds), Shifted())
-    return Trainer(IdentityEnv(seeds), agent, interval=50)
-
-
 def _train(trainer: Trainer) -> Trainer:
     list(trainer.run())
     return trainer

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from envs.plant.plant import Plant
-from hardware.actuator import THERMOSTAT
 from hardware.board.board_agent import reduce_sysdata
 from hardware.chibio import messages
 from hardware.chibio.config import ChiBioConfig
@@ -382,19 +381,6 @@ def test_a_resumed_run_remembers_repeats_and_silence() -> None:
     assert verdict.reasons[0].count("in 6 samples") == 1
 
 
-def test_a_temperature_is_cut_to_the_limits_and_that_is_said_once() -> None:
-    bench = Bench(5)
-    asked = np.array([20.0, 29.0, 33.2, 37.5, NAN])
-    np.testing.assert_array_equal(bench.interlock.command(THERMOSTAT, asked), [29.0, 29.0, 33.2, 36.0, NAN])
-    _, verdict = bench.step(*[1500.0] * 5)
-    cut = ("command_limit",)
-    assert verdict.kinds == (cut, (), (), cut, ())
-    assert "thermostat: 37.5 degC requested, allowed 29 to 36" in str(verdict.reasons[3])
-    assert bench.step(*[1600.0] * 5)[1].kinds == ((),) * 5
-
-
-def test_limits_of_the_temperature_are_settings() -> None:
-    interlock = Interlock(2, SafetyConfig(composition_low=30.0, composition_high=34.0))
-    np.testing.assert_array_equal(interlock.command(THERMOSTAT, np.array([-np.inf, np.inf])), [30.0, 34.0])
+def test_limits_of_the_temperature_leave_a_range() -> None:
     with pytest.raises(ValueError, match=r"safety\.composition_high = 30\.0: allowed 31 to 42"):
         SafetyConfig(composition_low=31.0, composition_high=30.0)

@@ -216,24 +216,32 @@ def test_a_refilled_bottle_ends_the_pause_of_a_feed_that_did_not_dilute_and_no_o
 
 
 def test_each_signal_s_command_is_cut_to_the_limits_of_its_own_actuator_and_told() -> None:
-    drive = Drive(SafetyConfig(composition_low=30.0, composition_high=34.0), Bench(max_rate=0.013))
-    lamp = Actuator("lamp", "%", 5.0, 85.0)
+    """Rows: below, at, above the limits, and none; a line names what was asked and both limits."""
+    config, bench = SafetyConfig(composition_low=30.0, composition_high=34.0), Bench(max_rate=0.013)
+    interlock, lamp = Interlock(4, config, bench), Actuator("lamp", "%", 5.0, 85.0)
     limits = {SPARE[3]: (0.0, 0.013), SPARE[4]: (0.0, 0.013), THERMOSTAT: (30.0, 34.0), lamp: (5.0, 85.0)}
     for actuator, (low, high) in limits.items():
-        for asked, given in ((np.nan, np.nan), (low, low), (low - 1.0, low), (high + 0.004, high)):
-            np.testing.assert_array_equal(drive.interlock.command(actuator, np.array([asked])), [given])
-    assert [fault.fields["actuator"] for fault in drive().faults[0]] == [actuator.name for actuator in limits]
-    assert drive(od=0.501).faults[0] == ()
+        given = interlock.command(actuator, np.array([low - 1.0, low, high + 0.004, np.nan]))
+        np.testing.assert_array_equal(given, [low, low, high, np.nan])
+    for told in ([actuator.name for actuator in limits], []):
+        od, time = np.full(4, 0.5 + 0.001 * len(told)), np.full(4, 60.0 * (len(told) == 0))
+        m = Measurement(time, od, np.full(4, 37.0), np.full(4, True))
+        found = interlock.check(m, np.full(4, 0.008), np.full(4, 0.5), np.full(4, 37.0), time[0]).faults
+        assert [[fault.fields["actuator"] for fault in faults] for faults in found] == [told, [], told, []]
 
 
 # -- attacked --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("seed", "period_s"), [(0, 60.0), (1, 30.0), (2, 120.0)])
-def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int, period_s: float) -> None:
+@pytest.mark.parametrize(
+    ("seed", "period_s", "given", "most_ml"), [(0, 60.0, None, 3.0), (1, 30.0, None, 2.1), (2, 30.0, 0.84, 0.84)]
+)
+def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(
+    seed: int, period_s: float, given: float | None, most_ml: float
+) -> None:
     rng = np.random.default_rng(seed)
     n, bench = 8, Bench(bottle_ml=150.0, period_s=period_s)
-    c = SafetyConfig(ml_per_minute=1.4 * bench.max_rate * period_s, ml_per_hour=30.0, silent=1e5)
+    c = SafetyConfig(ml_per_minute=given, ml_per_hour=30.0, silent=1e5)
     interlock = Interlock(n, c, bench)
     now, fed = 0.0, np.zeros(n)
     doses: list[tuple[float, np.ndarray]] = []
@@ -268,7 +276,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int, peri
         fed += feed
         assert np.all(level <= 25.0 + 1e-9)
         assert np.all(fed <= bench.bottle_ml + 1e-9)
-        assert np.all(sum(f for t, f in doses if now - t < 60.0) <= c.ml_a_minute(bench) + 1e-9)
+        assert np.all(sum(f for t, f in doses if now - t < 60.0) <= most_ml + 1e-9)
         assert np.all(sum(f for t, f in doses[-200:] if now - t < 3540.0) <= c.ml_per_hour + 1e-9)
         if rng.random() < 0.01:  # the program dies and comes back
             state = filed(interlock)

@@ -19,7 +19,7 @@ from hardware.pioreactor.versions import TESTED
 from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World, sampled
 from tests.hardware.script import noted
 
-MEDIA_S, SLACK_ML = 1.4 / FLOW["add_media"], 0.1
+SLACK_ML = 0.1
 BACK_S = 100.0  # after what was wrong is over, until a dose is possible again
 UNIT_HAS = pytest.mark.parametrize("version", TESTED)
 STIRRED = pytest.mark.parametrize("stirring", [True, False], ids=["stirred", "unstirred"])

@@ -86,9 +86,8 @@ def test_a_fault_is_told_in_its_third_sample_in_a_row_of_its_own_reactor() -> No
     steps = ("x.", ".x", "x.", "xx", "xx", ".x", "x.", "x.")
     lines = []
     for minute, faults in enumerate(steps):
-        vitals = Vitals(
-            np.zeros(n), np.full(n, 9000.0), tuple(LinkFault("x") if one == "x" else None for one in faults)
-        )
+        seen = tuple(LinkFault("x") if one == "x" else None for one in faults)
+        vitals = Vitals(np.zeros(n), np.full(n, 9000.0), seen)
         od = np.full(n, 0.5 + 1e-3 * (minute % 5))
         m = Measurement(np.full(n, 60.0 * minute), od, np.full(n, 37.0), np.full(n, True), vitals)
         reasons = interlock.check(m, np.zeros(n), np.full(n, 0.5), np.full(n, np.nan), 60.0 * minute).reasons
