@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 WINDOW = {
     "reactor": "reactor", "setpoint": "setpoint, OD", "start_min": "from, min", "end_min": "to, min",
     "steady_abs_error": "steady error, OD", "settling_min": "settled after, min", "ise": "ISE, OD² min",
-    "itae": "ITAE, OD min²", "abs_error": "mean |e|, OD",
+    "itae": "ITAE, OD min²", "abs_error": "mean error, OD",
 }  # fmt: skip
 
 
